@@ -217,6 +217,22 @@ def check_observed(name: str, Y: Tensor) -> None:
     _check_rows(name, Y.isnan().all(-1), expected)
 
 
+def check_transform(transform: Any, X: Tensor) -> None:
+    """Raise a ValueError if a transform of inputs ``n x d`` learns, or has other rows than they."""
+    name = type(transform).__name__
+    if any(parameter.requires_grad for parameter in transform.parameters()):
+        raise ValueError(
+            f"The parameters of a transform are not learnt; {name} has some. Set their values, and "
+            "fix them by `transform.requires_grad_(False)`."
+        )
+    found = tuple(transform(X).shape)
+    if found[:-1] != X.shape[:-1]:
+        raise ValueError(
+            f"Expected an input_transform that makes one row of each row; {name} makes shape "
+            f"{found} of {tuple(X.shape)}."
+        )
+
+
 def _check_rows(name: str, is_wrong: Tensor, expected: str) -> None:
     if is_wrong.any():
         rows = marked_rows(is_wrong)

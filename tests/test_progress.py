@@ -6,6 +6,8 @@ import pytest
 
 from gpadjust import ZeroMeanGP, fit, progress
 from gpadjust.progress import long_work, progress_bar, tick
+from gpadjust.records import Record, Records, smooth
+from gpadjust.states import StateSpec
 from tests.systems import line
 
 
@@ -28,6 +30,7 @@ def test_tqdm_is_needed_where_one_is_shown(monkeypatch):
         progress_bar(True, [5, 6])
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
 def test_a_fit_shows_a_bar_after_five_seconds_where_somebody_sees_it(capsys, monkeypatch):
     X = line(5)
     for is_seen, patience in ((True, 5.0), (False, 0.0), (True, 0.0)):
@@ -35,6 +38,9 @@ def test_a_fit_shows_a_bar_after_five_seconds_where_somebody_sees_it(capsys, mon
         monkeypatch.setattr(progress, "PATIENCE", patience)
         fit(ZeroMeanGP(X, X.sin()), "map")
         assert ("evaluations" in capsys.readouterr().err) == (is_seen and patience == 0)
+    records = Records(Record(X[:, 0], X.sin(), X), StateSpec(["x"], ["u"]))
+    smooth(records, lambda X: X[:, :1], max_rounds=3, num_starts=1)
+    assert " rounds" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "tqdm", None)
     fit(ZeroMeanGP(X, X.sin()), "map")
     assert not capsys.readouterr().err

@@ -7,11 +7,13 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
+from functools import partial
 from numbers import Real
 from typing import Any, Self
 
 import torch
 from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
+from botorch.models.model import Model
 from torch import Tensor
 
 from gpadjust.active.keep import Keep
@@ -19,11 +21,12 @@ from gpadjust.active.measurement_log import LogError, MeasurementLog, Record
 from gpadjust.active.measurements import (
     Measurements,
     as_options,
+    check_call,
     checked_outcomes,
     measurement,
     refusal,
 )
-from gpadjust.active.points import among, best_points, sobol_points
+from gpadjust.active.points import among, best_points, limits_among, sobol_points
 from gpadjust.checks import (
     checked_bounds,
     checked_number,
@@ -47,7 +50,8 @@ class CollectionError(RuntimeError):
 
     Attributes:
         collection: The collection so far.
-        X: The points of the last call of the oracle, ``q x d``.
+        X: The points of the last call of the oracle, ``q x d``; none if the next could not be
+            chosen.
         result: The values of the oracle, if the collection could not take them.
     """
 
@@ -90,7 +94,9 @@ class Collection(Measurements, Display):
         probability: Probability of a measurement within the limits of ``keep``, noise included.
         num_outputs: Number ``m`` of outputs. Default: by the first measurement.
         fit: Fits a new model, in place. Default: :func:`gpadjust.fit`, for models of this library.
-        optimizer_options: Arguments of ``optimize_acqf``, not with ``keep``.
+        optimizer_options: Arguments of ``optimize_acqf``, not with ``keep``. Constraints and fixed
+            features need first points within them, in ``initial`` or ``data``; later points may
+            then be near failed ones.
         log: The file of the log.
         seed: Seed of the design and of the maximisation of the acquisition function. The global
             random state does not change.
@@ -131,15 +137,26 @@ class Collection(Measurements, Display):
         log: str | os.PathLike[str] | None = None,
         seed: int = 0,
     ) -> None:
+        if isinstance(model_factory, Model):
+            raise TypeError(
+                "Expected model_factory to make a new model of all data, got a model; pass "
+                f"`functools.partial({type(model_factory).__name__}, ...)`."
+            )
         functions = {"model_factory": model_factory, "acquisition": acquisition}
         functions |= {n: f for n, f in {"fit": fit, "keep": keep}.items() if f is not None}
         for name, function in functions.items():
-            if not callable(function):
-                raise TypeError(f"Expected {name} to be callable, got {function!r}.")
+            check_call(name, function)
         if isinstance(acquisition, AcquisitionFunction):
             raise TypeError(
                 "Expected acquisition to be a function of each new model, got one of a model; pass "
                 f"`lambda model: {type(acquisition).__name__}(model, ...)`."
+            )
+        structure = partial(model_factory).func
+        is_other = isinstance(structure, type) and not hasattr(structure, "log_likelihood")
+        if is_other and fit is None:
+            raise TypeError(
+                f"The default fit takes models of gpadjust; found {model_factory!r}. Pass fit=, a "
+                "function that fits a model in place."
             )
         checked_number("probability", probability, above=0, below=1)
         self.keep = None if keep is None else Keep(keep, probability)
@@ -148,9 +165,14 @@ class Collection(Measurements, Display):
         self.batch_size = checked_whole("batch_size", batch_size, 1)
         self.seed = checked_whole("seed", seed, 0)
         d = self.bounds.shape[-1]
+        self._options = as_options(optimizer_options)
+        limits = limits_among(self._options)
+        if keep is not None:
+            limits = ["keep"]
+        self._has_limits = bool(limits)
         # A model needs a scale, that is two measurements of each output.
         if initial is None:
-            initial = 2 * (d + 1) if keep is None else 2
+            initial = 2 if limits else 2 * (d + 1)
         self._first_points = self.bounds[:0]
         if not isinstance(initial, Real | str):
             self._first_points = checked_points("initial", initial, d, self.bounds)
@@ -162,7 +184,6 @@ class Collection(Measurements, Display):
                 )
         self._fit = fit or fit_by_default
         self._initial = checked_whole("initial, a number of points,", initial, 2)
-        self._options = as_options(optimizer_options)
         # optimize_acqf has no constraints by a model.
         if keep is not None and self._options:
             raise ValueError(
@@ -172,11 +193,12 @@ class Collection(Measurements, Display):
         if num_outputs is not None:
             checked_whole("num_outputs", num_outputs, 1)
         super().__init__(self.bounds, num_outputs, data)
-        # A model that limits points needs safe measurements before.
-        if keep is not None and len(self._first_points) + self.num_observed < 2:
+        # A model that limits points needs measurements within the limits before.
+        if limits and len(self._first_points) + self.num_observed < self._initial:
             raise ValueError(
-                "With keep, the first points must be known as safe, by f_p for example: pass two "
-                "or more as initial=[[...], ...], or measurements as data=(X, Y); found "
+                f"With {' and '.join(limits)}, the first points must be known as safe, by f_p for "
+                f"example, or as within the constraints: pass {self._initial} or more as "
+                "initial=[[...], ...], or measurements as data=(X, Y); found "
                 f"{len(self._first_points)} and {self.num_observed}."
             )
         self._model: Any = None
@@ -322,7 +344,7 @@ class Collection(Measurements, Display):
             LogError: If the log cannot be written.
             CollectionError: If the oracle fails too often, or its result cannot be measured values
                 or cannot be logged: the error has it as ``result``, and the points are still
-                pending.
+                pending. Also if, after the first measurement, the next points cannot be chosen.
         """
         if not callable(oracle):
             raise TypeError(f"Expected the oracle to be callable, got {oracle!r}.")
@@ -334,7 +356,7 @@ class Collection(Measurements, Display):
             while self.num_measured < budget:
                 q = min(self.batch_size, budget - self.num_measured)
                 # Pending points come first: a killed run has measured them or not.
-                X = self.pending[:q] if len(self.pending) else self.ask(q)
+                X = self._next_points(q)
                 num_before = len(self.X)
                 error = self._measure(oracle, X)
                 # Single failures are skipped; many in a row are a broken oracle.
@@ -357,13 +379,31 @@ class Collection(Measurements, Display):
         if self.log is not None:
             self.log.close()
 
+    def _next_points(self, q: int) -> Tensor:
+        """Return pending points, or those of :meth:`ask`; its errors do not lose measurements."""
+        if len(self.pending):
+            return self.pending[:q]
+        try:
+            return self.ask(q)
+        except Exception as error:
+            # A log has all measurements.
+            if isinstance(error, LogError) or not self.num_measured:
+                raise
+            message = (
+                f"The next points could not be chosen ({type(error).__name__}: {error}). The "
+                f"{len(self.X)} measurements are in this error's `.collection`; "
+                f"{self._log_path()}. To continue, correct the call, and pass "
+                "data=(collection.X, collection.Y), or the same log."
+            )
+            raise CollectionError(message, self, self.pending) from error
+
     def _design(self, q: int) -> Tensor | None:
         """Return the next points of the design, ``q x d``, or None if a model chooses."""
         earlier = torch.cat([self.X, self.failed_X, self._asked])
         first = self._first_points[~among(self._first_points, earlier)]
         if not len(first) and len(self.X) >= self._initial and self.num_observed >= 2:
             return None
-        if self.keep is not None:  # Sobol points may not be safe
+        if self._has_limits:  # Sobol points may be outside
             if len(first):
                 return first[:q]
             raise RuntimeError(

@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import json
 import math
+from inspect import signature
 from typing import Any
 
 import torch
+from botorch.optim import optimize_acqf
+from botorch.optim.initializers import gen_batch_initial_conditions
 from torch import Tensor
 
 from gpadjust.active.measurement_log import Record
 from gpadjust.active.points import NEAR, among, distances
 from gpadjust.checks import check_observed, checked_points, checked_tensor
+
+_EXAMPLES = {  # of functions, with their numbers of arguments
+    "model_factory": (2, "functools.partial(CKA, physics=f_p)"),
+    "acquisition": (
+        1,
+        "lambda model: qLogExpectedImprovement(model, best_f=model.data.Y.max())",
+    ),
+    "fit": (1, "lambda model: fit(model, num_draws=256)"),
+    "keep": (1, "lambda Y: Y - 3"),
+}
 
 
 class Measurements:
@@ -153,7 +166,7 @@ def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor
 
 
 def as_options(options: Any) -> dict[str, Any]:
-    """Return options of ``optimize_acqf``; raise a ValueError if the collection sets one."""
+    """Return options of ``optimize_acqf``; others, and those set here, are errors."""
     if options is None:
         return {}
     if not isinstance(options, dict):
@@ -161,4 +174,31 @@ def as_options(options: Any) -> dict[str, Any]:
     twice = {"acq_function", "bounds", "q", "return_best_only", "return_full_tree"} & set(options)
     if twice:
         raise ValueError(f"Expected optimizer_options without {sorted(twice)}, which are set here.")
+    functions = (optimize_acqf, gen_batch_initial_conditions)
+    arguments = {name for function in functions for name in signature(function).parameters}
+    unknown = sorted({*options} - (arguments - {"ic_gen_kwargs"}))
+    # A generator of starts may have further arguments.
+    if unknown and "ic_generator" not in options:
+        raise ValueError(
+            f"Unknown optimizer_options {unknown}; expected arguments of BoTorch's optimize_acqf, "
+            "such as num_restarts and raw_samples."
+        )
     return options
+
+
+def check_call(name: str, function: Any) -> None:
+    """Raise a TypeError unless a function of a collection can be called as it will be."""
+    if not callable(function):
+        raise TypeError(f"Expected {name} to be callable, got {function!r}.")
+    num_arguments, example = _EXAMPLES[name]
+    try:
+        call = signature(function)
+    except ValueError:  # a function in C may have none
+        return
+    try:
+        call.bind(*range(num_arguments))
+    except TypeError as error:
+        raise TypeError(
+            f"Expected {name} as a function of {num_arguments} argument(s), such as `{example}`; "
+            f"{function!r} cannot be called so: {error}."
+        ) from error

@@ -15,6 +15,12 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 NEAR = 0.01  # of the bounds' widths: closer points count as the same
+_LIMITS = (
+    "inequality_constraints",
+    "equality_constraints",
+    "nonlinear_inequality_constraints",
+    "fixed_features",
+)
 _OTHERS = 256  # random points, of which the best replaces one too close to others
 
 
@@ -25,6 +31,11 @@ def sobol_points(bounds: Tensor, q: int, earlier: Tensor, seed: int) -> Tensor:
     unit = engine.draw(len(earlier) + q, dtype=torch.float64)
     points = bounds[0] + (bounds[1] - bounds[0]) * unit
     return points[~among(points, earlier)][:q]
+
+
+def limits_among(options: dict[str, Any]) -> list[str]:
+    """Return the names of options of ``optimize_acqf`` that random points do not keep."""
+    return [name for name in _LIMITS if options.get(name)]
 
 
 def among(points: Tensor, others: Tensor) -> Tensor:
@@ -44,7 +55,8 @@ def best_points(
 ) -> Tensor:
     """Return points of a maximum of an acquisition function, ``q x d``, by ``optimize_acqf``.
 
-    Failed points count as pending, so that their neighbourhood has no value, and no point is near.
+    Failed points count as pending, so that their neighbourhood has no value, and no point is near
+    one, except with constraints among the options.
     """
     # A line search that rounding errors end has converged: a second try is not needed.
     defaults = {"num_restarts": 8, "raw_samples": 128, "retry_on_optimization_warning": False}
@@ -57,6 +69,8 @@ def best_points(
             avoided = failed
         points, _ = optimize_acqf(acquisition, bounds, q=q, **{**defaults, **options})
         points = points.detach()
+        if limits_among(options):  # a random place may be outside
+            return points
         for i in range(q):
             if (distances(points[i : i + 1], avoided, bounds) < NEAR).any():
                 points[i] = _elsewhere(acquisition, points, i, avoided, bounds)

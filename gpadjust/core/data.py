@@ -13,7 +13,7 @@ import torch
 from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
-from gpadjust.checks import check_finite, check_observed, marked_rows
+from gpadjust.checks import check_finite, check_observed, check_transform, marked_rows
 
 ArrayLike = Any
 """A float64 tensor, or a NumPy array, DataFrame or Series (pandas or polars) of numbers."""
@@ -70,24 +70,24 @@ class Data(NamedTuple):
         Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y)
         if input_transform is not None:
             input_transform(X)
-            input_transform.eval()
+            check_transform(input_transform.eval(), X)
         _warn_of_copies(X, Y)
-        names = (names_of(train_X, "x"), names_of(train_Y, "y"))
-        return cls(X, Y, Yvar, *names, input_transform)
+        return cls(X, Y, Yvar, names_of(train_X, "x"), names_of(train_Y, "y"), input_transform)
 
     def new_inputs(self, X: ArrayLike) -> Tensor:
         """Return checked inputs ``... x q x d`` of a call."""
-        names = None
-        if not isinstance(X, Tensor):
-            names = column_names(X)
+        names = None if isinstance(X, Tensor) else column_names(X)
         if names is not None and names != self.input_names and {*names} & {*self.input_names}:
             raise ValueError(f"Expected columns {self.input_names}, in this order; found {names}.")
         X = as_tensor(_coded(X, self.transform), "X")
         d = len(self.input_names)
         if X.dim() < 2 or X.shape[-1] != d:
+            reshaped = "column is `X.reshape(-1, 1)`"
+            if X.shape == (d,):
+                reshaped = "point is `X.reshape(1, -1)`"
             raise ValueError(
                 f"Expected X of shape ... x q x {d}, the columns {', '.join(self.input_names)}; "
-                f"found {tuple(X.shape)}. One column is `X.reshape(-1, 1)`."
+                f"found {tuple(X.shape)}. One {reshaped}."
             )
         if not torch.isfinite(X.detach().sum()):  # one number is checked faster than all
             check_finite("X", X)

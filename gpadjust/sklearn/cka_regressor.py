@@ -49,8 +49,9 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     model estimates the scales of inputs and targets; it needs no scaler.
 
     *The inputs of the physics* are the X of the regressor, as arrays with the columns in their
-    order. After a ``StandardScaler`` in a pipeline, that is the scaled X: undo it in the physics,
-    or scale inside of the model, by ``model_options={"input_transform": Normalize(d)}`` of BoTorch.
+    order. After a ``StandardScaler`` in a pipeline, that is the scaled X, by other numbers in each
+    fold of a cross-validation, so that the physics cannot undo it. Scale inside of the model, by
+    ``model_options={"input_transform": Normalize(d)}`` of BoTorch, which the physics does not see.
     The physics must return values in the units of y: ``TransformedTargetRegressor`` transforms y,
     not the physics.
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from botorch import fit_gpytorch_mll
-from botorch.acquisition import LogExpectedImprovement
+from botorch.acquisition import LogExpectedImprovement, qLogExpectedImprovement
 from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize
 from gpytorch.mlls import ExactMarginalLogLikelihood
@@ -361,12 +361,13 @@ def _parameters(model):
 
 
 GIVEN = torch.ones(4, 2, dtype=torch.float64)
+PAIR = (GIVEN.cumsum(0), GIVEN)
+FIXED = {"fixed_features": {1: 0.5}}
 REFUSED = [
     ({"budget": 0}, "budget must be at", ValueError),
     ({"bounds": [0.0, 1.0]}, r"shape 2 x d.* got \(2,\)", ValueError),
     ({"model_factory": 3}, "Expected model_factory to be callable, got 3", TypeError),
     ({"acquisition": 3}, "Expected acquisition to be callable, got 3", TypeError),
-    ({"acquisition": lambda model: model}, "BoTorch AcquisitionFunction, got CKA", TypeError),
     ({"initial": 1}, "initial, a number of points, must", ValueError),
     ({"initial": [[5.0, 0.0], [1.0, 0.0]]}, r"initial within the bounds .*5.0, 0.0", ValueError),
     ({"initial": torch.ones(3, 1)}, r"Expected initial of shape n x 2", ValueError),
@@ -379,16 +380,26 @@ REFUSED = [
     ({"seed": True}, "seed must be a whole number; found True", TypeError),
     ({"optimizer_options": [1]}, r"to be a dictionary, got \[1\]", TypeError),
     ({"optimizer_options": {"q": 2}}, r"without \['q'\]", ValueError),
-    ({"model_factory": lambda X, Y: 3}, "factory to make a botorch Model; found int", TypeError),
     ({"log": 3}, "log to be the path of a file, got 3", TypeError),
     (
-        {"acquisition": qAdjustmentInformationGain(CKA(GIVEN.cumsum(0), GIVEN, physics=torch.sin))},
+        {"acquisition": qAdjustmentInformationGain(CKA(*PAIR, physics=torch.sin))},
         "pass `lambda model: qAdjustmentInformationGain",
         TypeError,
     ),
+    ({"acquisition": qLogExpectedImprovement}, "`lambda model: .*argument: 'best_f'", TypeError),
+    ({"model_factory": CKA}, r"partial\(CKA, physics=f_p\)`.*argument: 'physics'", TypeError),
+    ({"model_factory": CKA(*PAIR, physics=torch.sin)}, "got a model; pass", TypeError),
+    ({"model_factory": SingleTaskGP, "fit": None}, "default fit .* Pass fit=", TypeError),
+    ({"fit": lambda: None}, r"`lambda model: fit\(.* too many", TypeError),
     (
-        {"acquisition": lambda model: LogExpectedImprovement(model, 1.0), "batch_size": 2},
-        "LogExpectedImprovement takes one .* got q = 2",
+        {"optimizer_options": FIXED, "data": PAIR, "initial": 5},
+        "5 or more .* found 0 and 4",
+        ValueError,
+    ),
+    ({"optimizer_options": {"num_restart": 2}}, r"Unknown .* \['num_restart'\]", ValueError),
+    (
+        {"optimizer_options": FIXED, "initial": None},
+        "With fixed_features, .* 2 or more .* found 0",
         ValueError,
     ),
 ]
@@ -396,7 +407,40 @@ REFUSED = [
 
 @pytest.mark.parametrize(("changes", "words", "error"), REFUSED)
 def test_what_cannot_be_collected_by_is_refused(laboratory, changes, words, error):
-    refused(error, words, collect, **laboratory(**changes))
+    oracle = Oracle()
+    refused(error, words, collect, **laboratory(oracle=oracle, **changes))
+    assert not oracle.asked
+
+
+LATE = [
+    ({"acquisition": lambda model: model}, "TypeError.* AcquisitionFunction, got CKA"),
+    ({"model_factory": lambda X, Y: 3}, "TypeError.*factory to make a botorch Model; found int"),
+    ({"fit": lambda model: 1 / 0}, r"\(ZeroDivisionError: division by zero\)\. The 4 meas"),
+    (
+        {"acquisition": lambda model: LogExpectedImprovement(model, 1.0), "batch_size": 2},
+        "LogExpectedImprovement takes one .* got q = 2",
+    ),
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), LATE)
+def test_what_shows_after_measurements_does_not_lose_them(laboratory, changes, words):
+    with pytest.raises(CollectionError, match=words) as caught:
+        collect(**laboratory(**changes))
+    data = caught.value.collection.X, caught.value.collection.Y
+    torch.testing.assert_close(data[1], truth(data[0]))
+    assert len(data[0]) == 4
+    assert torch.equal(collect(**laboratory(data=data, budget=1)).X[:4], data[0])
+
+
+def test_points_are_within_constraints_and_have_their_fixed_features(laboratory):
+    # x1 <= 1; x2 = 0.5
+    below = [(torch.tensor([0]), -torch.ones(1, dtype=torch.float64), -1.0)]
+    options = {"num_restarts": 1, "raw_samples": 4, "inequality_constraints": below, **FIXED}
+    first = [[0.2, 0.5], [0.9, 0.5]]
+    X = collect(**laboratory(initial=first, optimizer_options=options, budget=5)).X
+    assert (X[:, 0] <= 1 + 1e-6).all()
+    assert (X[:, 1] == 0.5).all()
 
 
 OTHER = [

@@ -4,6 +4,7 @@ import pandas as pd
 import pytest
 import torch
 from botorch.models import SingleTaskGP
+from botorch.models.transforms.input import AppendFeatures, InputPerturbation, Warp
 from botorch.sampling import SobolQMCNormalSampler
 from gpytorch.kernels import RBFKernel
 
@@ -25,6 +26,7 @@ BA = pd.DataFrame({"b": X[:, 0], "a": X[:, 0].sin()})
 NAMED = ZeroMeanGP(BA, Y)
 INFINITE = torch.tensor([[0.0], [torch.inf]], dtype=torch.float64)
 FUNCTIONS = MODEL.sample_functions(3, seed=0)
+ROWS = torch.zeros(3, 1, dtype=torch.float64)
 WEIGHTS = torch.ones(1, dtype=torch.float64)
 
 
@@ -71,6 +73,11 @@ REFUSED = [
     (lambda: cka(center="learn"), TypeError, "Expected center as a number, or center=True"),
     (lambda: cka(noise=HeavyTails), TypeError, r"noise as an instance, HeavyTails\(\)"),
     (lambda: cka(input_transform=Categories), TypeError, r"as an instance, Categories\(\)"),
+    (lambda: cka(input_transform=Warp(1, [0])), ValueError, r"not learnt; Warp.*requires_grad_"),
+    (lambda: cka(input_transform=InputPerturbation(ROWS)), ValueError, "one row of each row"),
+    (lambda: cka(input_transform=AppendFeatures(ROWS)), ValueError, r"\(36, 2\) of \(12, 1\)"),
+    (lambda: NAMED.posterior(NAMED.data.X[0]), ValueError, r"One point is `X.reshape\(1, -1\)`"),
+    (lambda: MODEL.posterior(X[:, 0]), ValueError, r"One column is `X.reshape\(-1, 1\)`"),
     (lambda: cka(outcome_transform="log"), ValueError, "LinkedCKA"),
     (lambda: CKA(FRAME, Y, physics=wave), TypeError, r"found str\..*Categories\(\)"),
     (lambda: CKA(X, Y, physics=lambda X: X.expand(12, 2)), ValueError, "1 outputs of physics"),

@@ -8,7 +8,7 @@ import pytest
 import torch
 from botorch.models import SingleTaskGP
 
-from gpadjust import CKA, ZeroMeanGP
+from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError
 from tests.dynamics.conftest import FEW, push, pushed
@@ -90,9 +90,12 @@ def test_dynamics_of_another_physics_are_refused():
         one.load_state_dict(other.state_dict())  # which has no transitions
         assert getattr(one, "num_transitions", 0) == 0
     assert sum(rows) == 3  # of a physics alone
-    still, again = (PhysicsDynamics(SPEC, lambda X: X[:, :2]) for _ in range(2))
-    still.update(*transitions())
-    again.load_state_dict(still.state_dict())
+    learning = partial(LearnedDynamics, model=PhysicsMeanGP, fit_options=FEW)
+    for made in (PhysicsDynamics, learning):
+        still, again = (made(SPEC, lambda X: X[:, :2]) for _ in range(2))
+        still.update(*transitions())
+        again.load_state_dict(still.state_dict())
+    assert again.num_transitions == 12
 
 
 def test_a_whole_turn_is_no_difference():
@@ -169,6 +172,23 @@ def test_rows_of_a_failing_physics_are_those_that_were_asked_for():
     assert caught.value.rows == (8, 17)
     expected = torch.cat([states, actions], -1)[[8, 17]]
     assert torch.equal(caught.value.inputs, expected)
+
+
+def test_an_integrated_state_hides_no_failure():
+    """Nor where the physics fails in its column alone."""
+    spec = StateSpec(["x", "v"], ["a"], integrated={"x": "v"}, step=0.1)
+    states, actions, _ = transitions()
+    velocity = states[:, 1:] + 0.1 * actions
+    following = torch.cat([states[:, :1] + 0.05 * (states[:, 1:] + velocity), velocity], -1)
+    actions[7] = 2.5
+    for columns in ([True, True], [True, False]):
+        broken = torch.tensor(columns)
+        physics = FunctionPhysics(
+            lambda X, broken=broken: push(X).masked_fill((X[:, 2:] >= 2.1) & broken, torch.nan)
+        )
+        with pytest.raises(PhysicsError, match=r"NaN or inf in 1 of 12 row") as caught:
+            LearnedDynamics(spec, physics).update(states, actions, following)
+        assert caught.value.rows == (7,)
 
 
 # Arguments

@@ -53,6 +53,7 @@ def found(dynamics):
 def test_without_noise_the_parameters_are_exact():
     dynamics = PhysicsDynamics(PENDULUM, swing())
     assert dynamics.physics_parameters.mean.tolist() == [6.0, 0.1]
+    assert not PhysicsDynamics(LINE, lambda X: X[:, :1]).physics_parameters
     states, actions, following = swings()
     dynamics.update(states, actions, following)
     assert found(dynamics) == pytest.approx(TRUTH, rel=1e-6)

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from gpadjust.control import MPC, Planner, Task
 from gpadjust.dynamics import IdentifiedDynamics
-from gpadjust.physics import FormulaPhysics, PhysicsParameters, Unknown
+from gpadjust.physics import FormulaPhysics, FunctionPhysics, PhysicsParameters, Unknown
 from gpadjust.states import StateSpec
 from tests.systems import normal, same, uniform
 
@@ -72,6 +73,23 @@ def test_it_is_saved_and_loaded():
     other.physics = FormulaPhysics("x + a * a * u", ["x", "u"], unknowns={"a": PRIOR})
     with pytest.raises(RuntimeError, match=r"physics is 'x \+ a \* u' in the state"):
         other.load_state_dict(dynamics.state_dict())
+
+
+def test_a_controller_plans_in_it_and_learns_on():
+    """The physics of Python, too."""
+    physics = FunctionPhysics(lambda X, p: X[:, 0] + p.a * X[:, 1], unknowns={"a": PRIOR})
+    draws = PhysicsParameters({"a": PRIOR}, [0.7 + 0.2 * normal(64)])
+    noises = [torch.tensor([0.0, 0.01]).double()] * 2
+    dynamics = IdentifiedDynamics(SPEC, physics, draws, *noises)
+    task = Task(dynamics, lambda states, actions, following: -(following[:, 1] - 1).square())
+    controller = MPC(task, [[-0.5], [0.5]], Planner(horizon=3, num_random=32))
+    x = 0.0
+    for _ in range(8):
+        x += 1.3 * float(controller.step([0.0, x])[0])
+    controller.observe([0.0, x])
+    controller.learn()
+    assert abs(x - 1) < 0.1
+    assert dynamics.physics_parameters["a"].mean() == pytest.approx(1.3, abs=0.02)
 
 
 def test_it_predicts_by_the_center_of_a_ridge():

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gpadjust import CKA
+from gpadjust.core import Stationary, Term
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.physics import BlackBoxPhysics
 from tests.point import assert_equal
@@ -29,6 +30,28 @@ def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
         states, actions, next_states = system.trial(1)
         mean, _ = dynamics.predict(states, actions)
         torch.testing.assert_close(mean, next_states, rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["CKA", "RRA", "PhysicsMean"])
+def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
+    system = cart_pole_system
+    dynamics = make(kind, system.spec, system.crude)
+    assert not dynamics.is_fitted
+    for seed in range(2):
+        dynamics.update(*system.trial(seed))
+    assert dynamics.is_fitted
+    assert dynamics.num_transitions == 50
+    states, actions, next_states = system.trial(7)
+    scores = dynamics.score(states, actions, next_states)
+    for value in (scores.rmse, scores.median, scores.nlpd, scores.crps, scores.coverage):
+        assert value.shape == (4,)
+        assert value.isfinite().all()
+    assert ((scores.coverage >= 0) & (scores.coverage <= 1)).all()
+    physics_error = system.crude(torch.cat([states, actions], -1)) - next_states
+    ratio = (scores.rmse / physics_error.square().mean(0).sqrt())[2:].log()
+    # Random features are seen through a few frequencies only.
+    assert (ratio.mean() if kind == "RRA" else ratio.max()) < 0
 
 
 def test_scores_are_those_of_the_predictions(cart_pole_system, learnt_cart_pole):
@@ -102,6 +125,36 @@ def test_exogenous_and_integrated_states(uniform):
     for drawn in (dynamics.sample(new, pushes), functions(new[None], pushes[None])[0]):
         torch.testing.assert_close(drawn[:, 1], new[:, 1] + 0.05 * (new[:, 2] + drawn[:, 2]))
         torch.testing.assert_close(drawn[:, 0], new[:, 0])
+
+
+class WavyCKA(CKA):
+    """A structure of a user: CKA with more terms."""
+
+    def __init__(self, *data, waves=1, **options):
+        terms = [Term(f"wave_{i}", Stationary()) for i in range(waves)]
+        super().__init__(*data, extra_terms=terms, **options)
+
+
+@pytest.mark.slow
+def test_a_model_of_the_user(cart_pole_system):
+    system = cart_pole_system
+
+    def dynamics(**options):
+        model = partial(WavyCKA, **options)
+        return LearnedDynamics(system.spec, system.crude, model=model, fit_options=POINT_FIT)
+
+    one, other = (dynamics(waves=2, center=0.0) for _ in range(2))
+    for seed in range(2):
+        one.update(*system.trial(seed, 10))
+    assert [term.name for term in one.model.terms] == ["rho", "delta", "wave_0", "wave_1"]
+    assert one.describe()["model"] == "WavyCKA"
+    other.load_state_dict(one.state_dict())
+    states, actions, _ = system.trial(2)
+    assert torch.equal(*(each.predict(states, actions).mean for each in (one, other)))
+    with pytest.raises(RuntimeError, match=r"model_options is .*waves.* in the state"):
+        dynamics().load_state_dict(one.state_dict())
+    with pytest.raises(TypeError, match=r"Unknown option 'wave' of WavyCKA; .*waves"):
+        dynamics(wave=2).update(*system.trial(0, 10))
 
 
 def test_a_function_or_a_partial_makes_the_model(cart_pole_system):

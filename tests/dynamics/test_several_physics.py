@@ -18,6 +18,18 @@ def still():
     return lambda X: X[:, :4] + 0.1 * torch.cat([X[:, 2:4], torch.zeros_like(X[:, 2:4])], -1)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["PhysicsMean", "CKA", "RRA"])
+def test_every_structure_takes_several(cart_pole_system, make, still, kind):
+    system = cart_pole_system
+    dynamics = make(kind, system.spec, {"rod": system.crude, "still": still})
+    dynamics.update(*system.trial(0))
+    assert dynamics.score(*system.trial(1)).rmse.isfinite().all()
+    assert "rho_rod" in [term.name for term in dynamics.model.terms]
+    blocks = (part[:3].expand(2, -1, -1) for part in system.trial(1)[:2])
+    assert dynamics.sample_functions(2, seed=0)(*blocks).shape == (2, 3, 4)
+
+
 def test_the_better_physics_gets_the_weight(cart_pole_system, make, still):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, {"still": still, "truth": system.truth})

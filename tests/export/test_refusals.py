@@ -34,7 +34,7 @@ def fantasies():
 
 def warped():
     warp = Warp(d=2, indices=[0], bounds=torch.tensor([[0.0, 0.0], [1.0, 1.0]]).double())
-    return CKA(X, Y, physics=crude, input_transform=warp)
+    return CKA(X, Y, physics=crude, input_transform=warp.requires_grad_(False))
 
 
 def unlearnt():

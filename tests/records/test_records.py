@@ -262,6 +262,17 @@ def test_csv_files_are_read_as_pandas_reads_them(csv, uniform):
         assert record.segments == expected.segments
 
 
+def test_csv_files_without_times_or_with_a_name_twice(csv):
+    for text, options, end in (
+        ("q,dq,tau\n1,2,3\n4,5,6\n", {"time": 0.5}, 0.5),
+        ("x,q,x,dq,tau,time\na,1,a,2,3,0\na,4,a,5,6,1\n", {}, 1),
+    ):
+        (record,) = Records.read_csv(csv(text), POINT, **NAMES, **options)
+        assert record.times.tolist() == [0, end]
+        assert record.states.tolist() == [[1, 2], [4, 5]]
+        assert record.actions.tolist() == [[3], [6]]
+
+
 def test_columns_of_the_same_names_need_no_words_and_hidden_states_no_column(csv):
     (record,) = Records.read_csv(str(csv("time,v,u,x\n0,1,2,\n1,4,5,nan\n")), POINT)
     assert record.states.tolist() == [[pytest.approx(math.nan, nan_ok=True), v] for v in (1, 4)]

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 
+import openpyxl
 import pytest
 import torch
 
@@ -344,6 +345,17 @@ def test_a_german_spreadsheet_with_a_formula_of_a_spreadsheet(fitted, capsys):
     assert "y [mm] from d [mm]." in capsys.readouterr().err
     assert (data.input_names, data.output_names) == (("d [mm]",), ("y [mm]",))
     assert data.Y.flatten().tolist() == pytest.approx([1000 * (y + 3) for _, y in ROWS])
+
+
+@pytest.mark.slow
+def test_a_sheet_of_a_workbook_is_chosen(folder, undrawn):
+    book = openpyxl.Workbook()
+    for row in (("time [s]", "head [m]"), *ROWS):
+        book.active.append(row)
+    book.create_sheet("other")["A1"] = "notes"
+    book.save(folder / "data.xlsx")
+    assert main(["report", "data.xlsx", "--fit", "map", *FORMULA, "--sheet", "Sheet"]) == 0
+    assert load("report.pt").data.Y.flatten().tolist() == [y for _, y in ROWS]
 
 
 def test_a_column_pi_is_never_the_constant(fitted, fails):

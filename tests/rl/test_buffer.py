@@ -67,7 +67,12 @@ def test_a_sample_is_a_whole_row(buffer):
 
 
 def test_one_buffer_serves_where_the_other_does_not(buffer):
-    for num_real, num_model, mix, sign in ((5, 0, True, 1), (0, 5, True, -1), (5, 5, False, 1)):
+    for num_real, num_model, mix, sign in (
+        (5, 0, True, 1),
+        (0, 5, True, -1),
+        (5, 5, False, 1),
+        (5, 0, False, 1),
+    ):
         made = buffer(num_real, num_model, real_fraction=0.5)
         made.mix = mix
         assert (made.sample(16).rewards * sign > 0).all()
@@ -90,8 +95,8 @@ def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
     for size in chunks:
         mixed.add_model_rows(*rows(np.arange(start, start + size)))
         start += size
-    for i in range(1, start):
-        one.add(*real_row(i))
+    one.add(*real_row(1))
+    one.extend(*zip(*map(real_row, range(2, start)), strict=True))
 
     def in_order(buffer):
         first = buffer.pos if buffer.full else 0

@@ -105,22 +105,40 @@ def test_a_vectorised_environment_without_guards_gives_no_bad_data(point_agent, 
 
 
 class Jams(gymnasium.Wrapper):
-    """In the fourth step the system does not move, and says so."""
+    """At some steps, numbered from 0, the system does not move, and says so."""
 
-    steps = 0
+    def __init__(self, env, jams):
+        super().__init__(env)
+        self.jams, self.steps = jams, 0
 
     def step(self, action):
         before = self.env.unwrapped.x.copy()
         observation, reward, terminated, truncated, info = self.env.step(action)
-        failed = self.steps == 3
+        failed = self.steps in self.jams
         self.steps += 1
         if failed:
             self.env.unwrapped.x = observation = before
         return observation, reward, terminated, truncated or failed, info | {"step_failed": failed}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("jams", [(0,), (5, 6)])
+def test_a_step_that_failed_is_no_data(point_agent, point_env, learnt_dynamics, jams):
+    dynamics = learnt_dynamics()
+    agent = point_agent(Jams(point_env(), jams), dynamics=dynamics, reward_tolerance=None).learn(15)
+    assert agent.replay_buffer.size() == agent.num_timesteps - len(jams)
+    recorded = agent.recorded_episodes()
+    moved = recorded.next_states - recorded.states
+    torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+    follows = (recorded.states[1:] == recorded.next_states[:-1]).all(-1)
+    starts = [0, *(1 + follows.logical_not().nonzero().flatten()).tolist()]
+    assert (recorded.steps == 1).nonzero().flatten().tolist() == starts
+    assert (recorded.episode.diff() > 0).nonzero().flatten().add(1).tolist() == starts[1:]
+    assert dynamics.num_transitions <= len(recorded)
+
+
 def test_of_several_environments_one_may_fail(point_agent, point_env):
-    env = DummyVecEnv([lambda: Jams(point_env()), point_env])
+    env = DummyVecEnv([lambda: Jams(point_env(), (3,)), point_env])
     agent = point_agent(env, train_freq=(5, "step"), reward_tolerance=None).learn(20)
     recorded = agent.recorded_episodes()
     assert len(recorded) == 18  # the step after the last of these begins an episode that goes on

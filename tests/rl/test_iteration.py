@@ -1,5 +1,6 @@
 """What an iteration of Dyna does: real steps, updates, model, model episodes."""
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -7,9 +8,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
-from gpadjust.dynamics import PhysicsDynamics, StateSpec
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.rl import DynaSAC, DynaTD3
+from gpadjust.systems import RememberAction
 from tests.rl.conftest import COLUMNS, model_rows
+
+POINT_FIT = {"method": "map"}
 
 
 @pytest.mark.slow
@@ -161,6 +165,39 @@ def test_a_first_episode_of_a_single_step_waits_for_the_second(
     agent.learn(2, reset_num_timesteps=False)
     assert agent.num_episodes == agent.task.dynamics.num_transitions == 3
     assert agent._n_updates == 3 + 3 * 2
+
+
+def pendulum_step(X):
+    """Pendulum-v1 of Gymnasium."""
+    theta, speed, torque = X.unbind(-1)
+    speed = (speed + (15 * theta.sin() + 3 * torque) * 0.05).clamp(-8, 8)
+    return torch.stack([theta + speed * 0.05, speed], dim=-1)
+
+
+def pendulum_reward(states, actions, next_states):
+    theta, speed = states.unbind(-1)
+    theta = torch.atan2(theta.sin(), theta.cos())
+    return -(theta.square() + 0.1 * speed.square() + 0.001 * actions[:, 0].square())
+
+
+def test_a_system_with_an_angle_of_another_order(point_agent):
+    """Its observations have the cosine first; it is wrapped as the guide says."""
+    env = gymnasium.make("Pendulum-v1", max_episode_steps=8)
+    space = gymnasium.spaces.Box(-8, 8, (3,))
+    env = gymnasium.wrappers.TransformObservation(env, lambda seen: seen[[1, 0, 2]], space)
+    spec = StateSpec(["theta", "speed"], ["torque"], angles=["theta"])
+    task = {"dynamics": PhysicsDynamics(spec, pendulum_step), "reward": pendulum_reward}
+    assert model_rows(point_agent(env, **task, episode_length=None).learn(16)) == 2 * 2 * 8
+
+
+def test_actions_taken_in_the_model_are_remembered(point_agent, point_env):
+    spec = StateSpec(["x", "last"], ["v"], previous={"last": "v"})
+    dynamics = LearnedDynamics(spec, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options=POINT_FIT)
+    agent = point_agent(RememberAction(point_env()), dynamics=dynamics).learn(10)
+    rows, n = agent.replay_buffer.model_buffer, model_rows(agent)
+    assert n == 2 * 2 * 5
+    last, actions = rows.next_observations[:n, 0, 1], 2 * rows.actions[:n, 0, 0]
+    np.testing.assert_allclose(last, actions, atol=1e-4)
 
 
 def test_several_environments(point_agent, point_env, learnt_dynamics):

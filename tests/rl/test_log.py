@@ -113,6 +113,9 @@ def test_callbacks_of_agents_are_called(point_agent, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.partition(" ")[0] for line in lines] == ["trial:", "fit:"] * 2
     assert re.match(r"trial: number 2, steps 5, reward -\d\S*, seconds ", lines[2])
+    with pytest.warns(match="rich is experimental"):
+        point_agent().learn(10, [print_progress], progress_bar=True)
+    assert "10/10" in capsys.readouterr().out
 
 
 def test_its_representation_says_what_it_is(point_agent):

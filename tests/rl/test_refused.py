@@ -14,6 +14,7 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import Dyna, DynaCallback, DynaSAC
 from tests.point import POINT_SPEC
+from tests.rl.conftest import model_rows
 
 LINE, PLANE = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (2,))
 
@@ -123,3 +124,7 @@ def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
         point_agent(reward=noisy).learn(5)
     for tolerance in (0.1, None):
         assert point_agent(reward=noisy, reward_tolerance=tolerance).learn(5).num_episodes == 1
+
+
+def test_a_time_limit_put_around_by_hand_is_read(point_agent):
+    assert model_rows(point_agent(episode_length=None).learn(5)) == 2 * 5

@@ -15,6 +15,7 @@ from gpadjust.systems import CartPoleSwingUpEnv
 from gpadjust.systems.swing_up import (
     CART_POLE_SPEC,
     REAL_CART_POLE,
+    CartPoleEquation,
     cart_pole_cost,
     equation_physics,
 )
@@ -127,6 +128,12 @@ def test_raw_observation_is_the_state_and_does_not_wrap():
 
 def test_forces_are_clipped():
     assert same([upright().step(np.array([10.0]))], [upright().step(np.array([1e6]))])
+
+
+def test_another_equation_changes_the_system():
+    env = CartPoleSwingUpEnv(equation=CartPoleEquation(0.5, 0.5, 1.0, 0.1))
+    env.reset(options={"state": [0.0, math.pi, 0.0, 0.0]})
+    assert np.isclose(env.step(np.zeros(1))[4]["cost"], 1 - math.exp(-2 * 2.0**2))
 
 
 def starting(state):
