@@ -10,7 +10,7 @@ import torch
 from matplotlib.axes import Axes
 
 from gpadjust import CKA, StackedGP, ZeroMeanGP, compare, fit
-from gpadjust.active import Collection
+from gpadjust.active import Collection, qAdjustmentInformationGain
 from gpadjust.control import MPCAgent, Planner, Task
 from gpadjust.control.summary import episode_rewards
 from gpadjust.display import html_table
@@ -46,7 +46,9 @@ def parameters(draws=40):
 
 def collection():
     """Seven points asked for, of which two are pending."""
-    found = Collection(partial(CKA, physics=wave), [[0, 0], [1, 2]], CKA, initial=7)
+    found = Collection(
+        partial(CKA, physics=wave), [[0, 0], [1, 2]], qAdjustmentInformationGain, initial=7
+    )
     points = found.ask(7)
     found.tell(points[:5], points[:5].sum(-1, keepdim=True))
     return found
