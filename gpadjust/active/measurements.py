@@ -15,6 +15,7 @@ from torch import Tensor
 from gpadjust.active.measurement_log import Record
 from gpadjust.active.points import NEAR, among, distances
 from gpadjust.checks import check_observed, checked_points, checked_tensor
+from gpadjust.words import plural
 
 _EXAMPLES = {  # of functions, with their numbers of arguments
     "model_factory": (2, "functools.partial(CKA, physics=f_p)"),
@@ -199,6 +200,6 @@ def check_call(name: str, function: Any) -> None:
         call.bind(*range(num_arguments))
     except TypeError as error:
         raise TypeError(
-            f"Expected {name} as a function of {num_arguments} argument(s), such as `{example}`; "
-            f"{function!r} cannot be called so: {error}."
+            f"Expected {name} as a function of {plural(num_arguments, 'argument')}, such as "
+            f"`{example}`; {function!r} cannot be called so: {error}."
         ) from error
