@@ -12,11 +12,11 @@ from torch import Tensor
 from gpadjust.checks import checked_whole
 from gpadjust.core import Prediction
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.least_squares import StepErrors, even_normal
+from gpadjust.dynamics.least_squares import StepErrors
 from gpadjust.dynamics.physics_dynamics import next_values
 from gpadjust.dynamics.state import check_numbers, fingerprint, loading
 from gpadjust.physics import Physics
-from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.physics.parameters import PhysicsParameters, even_normal
 from gpadjust.states import StateSpec
 
 _DRAWS = 32  # of the parameters, for the variance of a prediction

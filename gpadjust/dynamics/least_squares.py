@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import Physics, PhysicsWarning
+from gpadjust.physics.parameters import even_normal
 from gpadjust.physics.unknown import Unknowns
 from gpadjust.states import StateSpec
 
@@ -142,10 +143,3 @@ def _warn_of_parameters(unknowns: Unknowns, precision: Tensor, point: Tensor) ->
         listed = ", ".join(name for name, is_one in zip(unknowns, mask, strict=True) if is_one)
         if listed:
             warnings.warn(message.format(listed), PhysicsWarning, stacklevel=5)
-
-
-def even_normal(number: int, p: int, seed: int) -> Tensor:
-    """Return standard normal draws ``number x p`` that fill space evenly (Sobol)."""
-    engine = torch.quasirandom.SobolEngine(p, scramble=True, seed=seed)
-    shares = engine.draw(number, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
-    return torch.special.ndtri(shares)

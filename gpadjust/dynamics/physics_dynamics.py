@@ -15,11 +15,11 @@ from torch import Tensor
 from gpadjust.checks import checked_number, checked_tensor, checked_whole
 from gpadjust.core import Prediction
 from gpadjust.dynamics.base import Dynamics, Sampler, TransitionFunctions
-from gpadjust.dynamics.least_squares import even_normal, most_likely
+from gpadjust.dynamics.least_squares import most_likely
 from gpadjust.dynamics.state import check_numbers, columns_of, fingerprint, loading
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import ODEPhysics, Physics, PhysicsError, as_physics
-from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.physics.parameters import PhysicsParameters, even_normal
 from gpadjust.states import StateSpec
 
 _DRAWS = 1024

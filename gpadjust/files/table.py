@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gpadjust.files import fields as read
 from gpadjust.files.rows import is_value, numeric_columns, rows_of_sheet, rows_of_text
-from gpadjust.physics.formula import symbol
+from gpadjust.physics.base import symbol
 
 LARGEST = 1e100
 """The largest number that is accepted; squares of larger ones may overflow."""

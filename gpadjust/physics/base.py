@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import copy, deepcopy
+from keyword import iskeyword
 from typing import Any, Self
+from unicodedata import normalize
 
 import numpy as np
 import torch
@@ -272,3 +275,12 @@ def name_of(function: Any, name: str | None, argument: str = "function") -> str:
     if not callable(function):
         raise TypeError(f"{argument} must be callable; found {type(function).__name__}.")
     return name or str(getattr(function, "__name__", type(function).__name__))
+
+
+def symbol(name: str) -> str:
+    """Return the name of a column in a formula: without its unit, and ``_`` for other marks."""
+    name = normalize("NFKC", name.partition("[")[0].strip())  # as Python does with names
+    bare = re.sub(r"\W+", "_", name).strip("_")
+    if iskeyword(bare) or bare == "pi":
+        return f"{bare}_"
+    return f"_{bare}" if bare[:1].isdigit() else bare

@@ -8,7 +8,7 @@ import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from keyword import iskeyword, kwlist
+from keyword import kwlist
 from typing import Any
 from unicodedata import normalize
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_kind
-from gpadjust.physics.base import Physics
+from gpadjust.physics.base import Physics, symbol
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
@@ -160,15 +160,6 @@ class FormulaPhysics(Physics):
         for name, variable in self.variables.items():
             values[name] = curves[name](value(variable))
         return [value(output) for output in self.outputs]
-
-
-def symbol(name: str) -> str:
-    """Return the name of a column in a formula: without its unit, and ``_`` for other marks."""
-    name = normalize("NFKC", name.partition("[")[0].strip())  # as Python does with names
-    bare = re.sub(r"\W+", "_", name).strip("_")
-    if iskeyword(bare) or bare == "pi":
-        return f"{bare}_"
-    return f"_{bare}" if bare[:1].isdigit() else bare
 
 
 def names_in(formula: str) -> set[str]:

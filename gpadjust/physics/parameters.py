@@ -134,3 +134,10 @@ class PhysicsParameters(ParameterValues, Display):
     def _repr_html_(self) -> str:
         head, *rows = self._rows()
         return html_table("Parameters of the physics", head, rows)
+
+
+def even_normal(number: int, p: int, seed: int) -> Tensor:
+    """Return standard normal draws ``number x p`` that fill space evenly (Sobol)."""
+    engine = torch.quasirandom.SobolEngine(p, scramble=True, seed=seed)
+    shares = engine.draw(number, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
+    return torch.special.ndtri(shares)

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.records import kalman
+from gpadjust.records.chain import Chain, chain_of
 from gpadjust.records.kalman import Array
 from gpadjust.records.records import Records
-from gpadjust.records.smoothing import Chain, chain_of
 from gpadjust.states import Sensors
 from gpadjust.states.state_spec import side_by_side
 

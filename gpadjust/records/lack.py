@@ -15,8 +15,8 @@ from torch import Tensor
 
 from gpadjust.display import Display
 from gpadjust.records import kalman
+from gpadjust.records.chain import Chain, Estimate
 from gpadjust.records.kalman import Array, Link
-from gpadjust.records.smoothing import Chain, Estimate
 from gpadjust.states import StateSpec
 
 _CHANCE = 0.01  # that a right equation lacks something

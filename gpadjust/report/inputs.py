@@ -34,7 +34,8 @@ from gpadjust.physics import (
     Unknown,
     as_physics,
 )
-from gpadjust.physics.formula import has_pi, names_in, parse, symbol
+from gpadjust.physics.base import symbol
+from gpadjust.physics.formula import has_pi, names_in, parse
 from gpadjust.physics.function import array_physics
 from gpadjust.words import bare, labelled, listed, plural
 

@@ -393,7 +393,7 @@ FAULTS = (
         "The process noise is that of the most likely path: too small.",
     ),
     Fault(
-        "gpadjust/records/smoothing.py",
+        "gpadjust/records/chain.py",
         "if cost <= before + _BETTER:",
         "if not np.isnan(cost):",
         "The search takes a path that explains less.",

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from gpadjust import CKA, Unknown, fit, load, save
 from gpadjust.physics import FormulaPhysics, PhysicsError
-from gpadjust.physics.formula import symbol
+from gpadjust.physics.base import symbol
 from gpadjust.physics.import_path import import_path, physics_from_path
 from tests.systems import refused
 

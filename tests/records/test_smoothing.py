@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, smooth
+from gpadjust.records.chain import Chain, Estimate
 from gpadjust.records.kalman import (
     Link,
     Moments,
@@ -18,7 +19,6 @@ from gpadjust.records.kalman import (
     expected_squares,
     smooth_chain,
 )
-from gpadjust.records.smoothing import Chain, Estimate
 
 STEP, LENGTH = 0.1, 150
 SPEC = StateSpec(["x", "v"], ["force"])
