@@ -59,3 +59,15 @@ def html_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]])
         texts = [f"<{kind} {style}>{escape(cell)}</{kind}>" for cell in cells]
         lines += [f"<tr>{''.join(texts)}</tr>"] if texts else []
     return f"<table><caption>{escape(caption)}</caption>{''.join(lines)}</table>"
+
+
+def text_table(rows: Sequence[Sequence[str]]) -> str:
+    """Return rows of texts as lines with columns of one width.
+
+    Example:
+        >>> print(text_table([["", "mean"], ["mass", "0.25"]]))
+              mean
+        mass  0.25
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)

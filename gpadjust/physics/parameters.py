@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_level
-from gpadjust.display import Display, html_table
+from gpadjust.display import Display, html_table, text_table
 from gpadjust.physics.unknown import LARGEST, Curve, Unknown, Unknowns
 
 _AS_WIDE = 0.8  # of a prior's standard deviation, or more
@@ -127,9 +127,7 @@ class PhysicsParameters(ParameterValues, Display):
         return rows
 
     def __repr__(self) -> str:
-        rows = self._rows()
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+        return text_table(self._rows())
 
     def _repr_html_(self) -> str:
         head, *rows = self._rows()

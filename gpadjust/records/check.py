@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from copy import copy
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +32,7 @@ class Direction(NamedTuple):
 
     weights: dict[str, float]  # in standard deviations of the priors, of norm 1
     value: float  # errors of the sensors by which one standard deviation moves all measurements
-    input: str  # the input that would tell it best, and the value with it; empty if told
+    input: str  # the one that would tell it best, and the value with both; empty if determined
 
     def __str__(self) -> str:
         """Return the direction, its value and the input in a sentence."""
@@ -74,7 +76,8 @@ def check_log(
 
     Returns:
         The directions, the clearest first. Of those that the log does not tell, each names the
-        square wave of an action, as large as those recorded, that would tell it best.
+        square wave of an action, as large as those recorded, that would tell it best together with
+        the log, or that none of a few does.
 
     Raises:
         ValueError: If the physics has no unknown parameters; and as :func:`smooth`, as are other
@@ -97,12 +100,16 @@ def check_log(
     if not chain.unknowns:
         raise ValueError("Expected a physics with unknown parameters; found none, to check.")
     noise = np.maximum(_roughness(chain), chain.least)
-    values, vectors = np.linalg.eigh(_information(chain, noise))
+    information = _information(chain, noise)
+    values, vectors = np.linalg.eigh(information)
+    inputs = _Inputs(chain, noise, information)
     directions = []
     for value, vector in zip(np.sqrt(values.clip(0))[::-1], vectors.T[::-1], strict=True):
         vector = vector * np.sign(vector[np.abs(vector).argmax()])
         weights = dict(zip(chain.unknowns, vector.tolist(), strict=True))
-        text = _best_input(chain, noise, vector) if value < _WEAK else ""
+        text = ""
+        if value < _WEAK:
+            text = inputs.best(vector)
         directions.append(Direction(weights, float(value), text))
     return directions
 
@@ -133,38 +140,61 @@ def _information(chain: Chain, noise: Array, outputs: Array | None = None) -> Ar
     return even
 
 
-def _best_input(chain: Chain, noise: Array, vector: Array) -> str:
-    """Return a sentence on the square wave, of one action, that tells a direction best."""
-    spec, steps = chain.spec, chain.steps
-    best = 0.0
-    sentence = "None of the inputs that were tried does."
-    if len(spec.moving) < spec.state_dim:
-        return "Other inputs are tried for states that all move only."
-    length = min(max(len(record.times) for record in steps), _LONGEST)
-    recorded = torch.cat([record.actions for record in steps])
-    low, high = recorded.aminmax(dim=0)
-    is_constant = low == high
-    low, high = low - is_constant.to(low), high + is_constant.to(high)
-    step = steps.records[0].sampling_step
-    outputs = np.where(chain.hidden, math.nan, 0.0)
-    for j, name in enumerate(spec.actions):
-        for parts in _PERIODS:
-            half = max(1, length // parts)
-            actions = recorded.mean(0).repeat(length, 1)
-            is_high = torch.arange(length) // half % 2 == 0
-            actions[:, j] = torch.where(is_high, high[j], low[j])
-            try:
-                information = _information(_under(chain, actions), noise, outputs)
-            except (PhysicsError, np.linalg.LinAlgError):
-                continue
-            value = math.sqrt(max(float(vector @ information @ vector), 0.0))
-            if value > best:
-                best = value
-                sentence = (
+class _Inputs:
+    """Square waves of single actions, and the information of the log with each of them.
+
+    Args:
+        chain: The log.
+        noise: Variances of the sensors.
+        information: By the log alone, ``p x p``.
+    """
+
+    def __init__(self, chain: Chain, noise: Array, information: Array) -> None:
+        self.chain = chain
+        self.noise = noise
+        self.of_log = information
+
+    @cached_property
+    def tried(self) -> list[tuple[str, Array]]:
+        """Inputs in words, and the information with each; without those where f_p fails."""
+        chain = self.chain
+        length = min(max(len(record.times) for record in chain.steps), _LONGEST)
+        recorded = torch.cat([record.actions for record in chain.steps])
+        low, high = recorded.aminmax(dim=0)
+        is_constant = low == high
+        low, high = low - is_constant.to(low), high + is_constant.to(high)
+        step = chain.steps.records[0].sampling_step
+        outputs = np.where(chain.hidden, math.nan, 0.0)
+        tried = []
+        for j, name in enumerate(chain.spec.actions):
+            for parts in _PERIODS:
+                half = max(1, length // parts)
+                actions = recorded.mean(0).repeat(length, 1)
+                is_high = torch.arange(length) // half % 2 == 0
+                actions[:, j] = torch.where(is_high, high[j], low[j])
+                text = (
                     f"A square wave of {name} between {low[j]:.3g} and {high[j]:.3g} with half a "
-                    f"period of {half * step:.3g} would: {value:.3g}."
+                    f"period of {half * step:.3g}"
                 )
-    return sentence
+                with suppress(PhysicsError, np.linalg.LinAlgError):
+                    information = _information(_under(chain, actions), self.noise, outputs)
+                    tried.append((text, self.of_log + information))
+        return tried
+
+    def best(self, vector: Array) -> str:
+        """Return a sentence on the input that tells a direction best, beside all others."""
+        if len(self.chain.spec.moving) < self.chain.spec.state_dim:
+            return "Other inputs are tried for states that all move only."
+        best = 0.0
+        sentence = "None of the inputs that were tried does."
+        for text, information in self.tried:
+            # Of v' theta, with the prior N(0, 1): 1 / variance - 1
+            variance = vector @ np.linalg.solve(information + np.eye(len(vector)), vector)
+            value = math.sqrt(max(1 / float(variance) - 1, 0.0))
+            if value >= _WEAK and value > best:
+                best = value
+                sentence = f"{text} would: {value:.3g}."
+        return sentence
 
 
 def _under(chain: Chain, actions: Tensor) -> Chain:

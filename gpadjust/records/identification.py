@@ -9,8 +9,7 @@ from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from scipy.stats import t
@@ -18,11 +17,13 @@ from torch import Tensor
 
 import gpadjust
 from gpadjust.checks import checked_number, checked_whole
-from gpadjust.display import Display, html_table
+from gpadjust.display import Display, html_table, text_table
 from gpadjust.dynamics import FreeRun, IdentifiedDynamics, PhysicsDynamics, Windows
 from gpadjust.dynamics.physics_dynamics import one_physics
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.records import advice
+from gpadjust.records.advice import Combinations, combinations_of
 from gpadjust.records.lack import Lack, clearest_lack, robust_moments
 from gpadjust.records.records import Records, control_steps
 from gpadjust.records.smoothing import (
@@ -32,55 +33,31 @@ from gpadjust.records.smoothing import (
     smooth,
 )
 from gpadjust.states import Sensors, StateSpec
-from gpadjust.words import listed, number, percent
+from gpadjust.words import listed, number, percent, plural
 
 GUESSES = "guesses"
 IDENTIFIED = "identified"
 PERSISTENCE = "persistence"
 FEW = 0.9  # of measurements in intervals of 95 %
+_PARTICLES = 199  # of the free run that is judged
 _NO_NOISE = 1e-100  # standard deviation: the smoother takes the least that it computes with
 _LEAST = 8  # steps of a stretch, of which the last part is held out
-_FAR = 3.0  # standard deviations of a prior
-_VARIES = 1e-3  # share of the variance of an action that is within steps
-_NEAR_A_TURN = 0.12
-_TOGETHER = 0.95  # a correlation of two parameters, in logarithms
-_CLEARER = 0.15  # of the least standard deviation of the two: that of their combination
-_POWERS = ((1, -1), (1, 1), (1, -2), (1, 2), (2, -1), (2, 1))
 _MORE = 0.1  # of the measurements in intervals: clearly more
 _BLOCKS = 5  # of a window, whose errors are compared
+_JUMPY = 0.01  # of the steps: more jumps make a search end where it is
 _LARGE = 2.0  # times the noise of the sensor: an error that something missing may have made
-_WIDER = 1.5  # an interval that allows for missing forces, in place of the one that does not
-_OUTLYING = 20.0  # robust standard deviations of changes, by which a row is off both neighbours
-_TURNS = {2 * math.pi: "add it to `angles`", 360.0: "convert it to rad, and add it to `angles`"}
-_NAMED = 5  # rows in a sentence
-_UNSURE = 0.05  # of a prior's standard deviation: uncertainty that matters
-_MOVES = 0.01  # of a state's changes in a step: process noise that matters
 
 _UNSETTLED = (
     "The search for states and parameters did not settle, so that all of this may change: raise "
     "num_starts, give narrower priors, or a start of hidden states."
 )
+_JUMPS = (
+    "The physics jumps near {} of the steps, as sign(x) does at 0: the search ends at any of the "
+    "jumps, and intervals of parameters are too narrow. Write tanh(x/d) in place of sign(x), with "
+    "d some 5 % of the usual size of x, and identify again."
+)
 _BY = {False: "no less", True: "less by chance"}
 _OTHERS = {GUESSES: "the guesses", PERSISTENCE: "a state that stays"}
-_ENDS = torch.tensor([0.025, 0.5, 0.975])
-
-
-class Combination(NamedTuple):
-    """A product of powers of two parameters that the log tells better than either of them."""
-
-    name: str  # such as "k/J"
-    first: str
-    second: str
-    unit: str
-    draws: Tensor  # K
-
-    def __str__(self) -> str:
-        """Return a sentence on the value by the log."""
-        low, mid, high = self.draws.quantile(_ENDS.to(self.draws)).tolist()
-        return (
-            f"The log tells {self.name}, {mid:.4g} [{low:.4g}, {high:.4g}], and hardly "
-            f"{self.first} and {self.second} each. Measure one of them, and the other follows."
-        )
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -205,9 +182,9 @@ class Identification(Display):
         return self.smoothed.records.records[0].sampling_step
 
     @property
-    def combinations(self) -> list[Combination]:
+    def combinations(self) -> Combinations:
         """Ratios and products of two parameters that the log tells better than these."""
-        return _told_together(self.smoothed.parameters)
+        return combinations_of(self.smoothed.parameters)
 
     @property
     def verdicts(self) -> dict[str, tuple[str, list[str]]]:
@@ -219,31 +196,48 @@ class Identification(Display):
         than that of a state that stays, or larger than the guesses' beyond chance; else
         ``"In part"``.
         """
-        verdicts = {}
+        return {
+            name: self._verdict(i)
+            for i, name in enumerate(self.spec.states)
+            if not self.coverage[i].isnan()
+        }
+
+    def _verdict(self, i: int) -> tuple[str, list[str]]:
+        """Return the answer on state i, and why."""
         errors = self.errors
-        shares = self.coverage.tolist()
-        for i, name in enumerate(self.spec.states):
-            if math.isnan(shares[i]):
+        error = errors[IDENTIFIED][i]
+        share = self.coverage[i]
+        reasons = [f"Intervals of 95 % cover {percent(share)} of {self.spec.states[i]} there."]
+        reasons += self._doubts
+        if self.lack is not None and error > _LARGE * self.smoothed.noise[i]:
+            reasons.append(str(self.lack))
+        answer = "Yes"
+        if float(share) < FEW or len(reasons) > 1:
+            answer = "In part"
+        for other, words in _OTHERS.items():
+            if other not in errors:
                 continue
-            error = errors[IDENTIFIED][i]
-            reasons = [f"Intervals of 95 % cover {percent(shares[i])} of {name} there."]
-            if not self.smoothed.is_settled:
-                reasons.append(_UNSETTLED)
-            if self.lack is not None and error > _LARGE * self.smoothed.noise[i]:
-                reasons.append(str(self.lack))
-            answer = "In part" if shares[i] < FEW or len(reasons) > 1 else "Yes"
-            for other, words in _OTHERS.items():
-                if other not in errors:
-                    continue
-                path = self._paths[other]
-                is_less = bool(error < errors[other][i])
-                if is_less and self._beats(path, i):
-                    continue
-                is_no = not is_less and (other == PERSISTENCE or self._beats(path, i, -1))
-                answer = "No" if is_no or answer == "No" else "In part"
-                reasons.append(f"Its error is {_BY[is_less]} than that of {words}.")
-            verdicts[name] = answer, reasons
-        return verdicts
+            path = self._paths[other]
+            is_less = bool(error < errors[other][i])
+            if is_less and self._beats(path, i):
+                continue
+            is_no = not is_less and (other == PERSISTENCE or self._beats(path, i, -1))
+            if is_no:
+                answer = "No"
+            elif answer == "Yes":
+                answer = "In part"
+            reasons.append(f"Its error is {_BY[is_less]} than that of {words}.")
+        return answer, reasons
+
+    @property
+    def _doubts(self) -> list[str]:
+        """Return sentences on a search whose end decides nothing."""
+        sentences = []
+        if not self.smoothed.is_settled:
+            sentences.append(_UNSETTLED)
+        if self.smoothed.jumps > _JUMPY:
+            sentences.append(_JUMPS.format(percent(self.smoothed.jumps)))
+        return sentences
 
     @property
     def _paths(self) -> dict[str, Tensor]:
@@ -271,13 +265,17 @@ class Identification(Display):
     @property
     def advice(self) -> list[str]:
         """Sentences on the log, on parameters, and on errors that are too large."""
-        sentences = [] if self.smoothed.is_settled else [_UNSETTLED]
-        sentences += [*self.remarks, *_of_parameters(self.smoothed.parameters)]
+        smoothed = self.smoothed
+        sentences = [*self._doubts, *self.remarks, *advice.on_parameters(smoothed.parameters)]
+        sentences += self._of_starts()
         sentences += map(str, self.combinations)
-        sentences += self._of_forces()
+        if self.parameters is not None and self.robust_parameters is not None:
+            sentences += advice.on_forces(self.parameters, self.robust_parameters)
         if self.lack is not None:
             sentences.append(str(self.lack))
-        sentences += self._of_noise()
+        sentences += advice.on_process_noise(
+            smoothed.records, smoothed.noise, smoothed.process_noise, self.lack is not None
+        )
         cause = (
             "the physics lacks something whose errors last longer than process noise (dry "
             "friction, an input), or has a sign or unit wrong"
@@ -295,44 +293,17 @@ class Identification(Display):
                 sentences += self._of_free_runs(i)
         return sentences
 
-    def _of_forces(self) -> list[str]:
-        """Return a sentence on parameters that a force which may be missing makes uncertain."""
-        if self.parameters is None or self.robust_parameters is None:
+    def _of_starts(self) -> list[str]:
+        """Return a sentence if another start ended elsewhere, as likely as this one."""
+        rival = self.smoothed.rival
+        if rival is None:
             return []
-        low, high = self.robust_parameters.interval()
-        wider = []
-        times = self.robust_parameters.sd / self.parameters.sd
-        for i, name in enumerate(self.parameters):
-            z = self.parameters.unknowns[name].coordinate(self.robust_parameters[name])
-            if times[i] > _WIDER and z.std() > _UNSURE:
-                wider.append(f"{name} {low[i]:.3g} to {high[i]:.3g} ({times[i]:.2g} times as wide)")
-        return wider and [
-            "The intervals of parameters take errors of the equations for noise of each step. If "
-            "they lack a force that depends on the states, as large as the process noise, the log "
-            f"tells {', '.join(wider)}. Dry friction, for one, is hard to tell from damping."
+        names = self.smoothed.parameters.unknowns
+        values = [f"{name} = {number(x)}" for name, x in zip(names, rival, strict=True)]
+        return [
+            f"Another start ended at {', '.join(values)}, about as likely, and intervals are about "
+            "one end only: give narrower priors, or a longer log."
         ]
-
-    def _of_noise(self) -> list[str]:
-        """Return sentences on process noise that is larger than the noise of the sensor."""
-        sentences = []
-        moves = torch.cat([record.states.diff(dim=0) for record in self.smoothed.records])
-        sizes = moves.square().mean(0).sqrt()
-        noises = (self.smoothed.noise, self.smoothed.process_noise, sizes)
-        for i, (noise, added, size) in enumerate(zip(*noises, strict=True)):
-            if not added > noise or added < _MOVES * size:  # of hidden states it is NaN
-                continue
-            cause = "it stands for what the equations lack, and falls with it"
-            if self.lack is None:
-                cause = (
-                    "no state, action or lag explains it. Look for an input that was not logged; "
-                    "vibration or weather it may be, too, which the intervals then allow for"
-                )
-            name = self.spec.states[i]
-            sentences.append(
-                f"Process noise of {name} is {added:.2g} a step, {added / noise:.2g} times the "
-                f"noise of its sensor: {cause}."
-            )
-        return sentences
 
     def _of_free_runs(self, i: int) -> list[str]:
         """Return a sentence if the fit by free runs predicts state i better."""
@@ -351,30 +322,41 @@ class Identification(Display):
         ]
 
     def __repr__(self) -> str:
-        """Parameters, noises and errors."""
-        lines = [f"Identification by {self.smoothed!r}"]
-        if self.parameters is not None:
-            lines.append(repr(self.parameters))
-        places = [i for i, name in enumerate(self.spec.states) if name not in self.hidden]
-        names = ", ".join(self.spec.states[i] for i in places)
-        steps = self.windows.measured.shape[1]
-        lines.append(f"free run of {steps} steps, root mean square error ({names}):")
-        for name, error in self.errors.items():
-            lines.append(f"  {name}: {', '.join(f'{e:.3g}' for e in error[places].tolist())}")
-        shares = ", ".join(f"{100 * share:.0f} %" for share in self.coverage[places].tolist())
-        return "\n".join([*lines, f"  in intervals of 95 %: {shares}"])
+        """Tables of parameters, combinations, noises, and errors of free runs."""
+        steps = sum(len(record.times) - 1 for record in self.smoothed.records)
+        windows, held = self.windows.measured.shape[:2]
+        head = f"Identification by {plural(steps, 'step')}, {windows * held:,} held out"
+        tables = [repr(self.parameters), repr(self.combinations)]
+        if self.parameters is None:
+            tables = []
+        elif not self.combinations:
+            tables = tables[:1]
+        columns = ["", "noise", "process noise", *(f"error, {name}" for name in self.errors)]
+        rows = [
+            [name, number(noise), number(process_noise), *texts]
+            for noise, process_noise, (name, *texts) in zip(
+                self.smoothed.noise, self.smoothed.process_noise, self._rows(), strict=True
+            )
+        ]
+        return "\n".join([head, *tables, text_table([[*columns, "in 95 %"], *rows])])
+
+    def _rows(self) -> list[list[str]]:
+        """Return rows of the states' names, errors of free runs, and shares in the intervals."""
+        columns = [*map(torch.Tensor.tolist, self.errors.values())]
+        rows = []
+        for i, name in enumerate(self.spec.states):
+            texts = [name, *(number(errors[i]) for errors in columns), percent(self.coverage[i])]
+            if name in self.hidden:
+                texts[-1] = "hidden"
+            rows.append(texts)
+        return rows
 
     def _repr_html_(self) -> str:
         parameters = ""
         if self.parameters is not None:
             parameters = self.parameters._repr_html_()
         caption = f"Errors of free runs of {self.windows.measured.shape[1]} steps"
-        columns = [*map(torch.Tensor.tolist, self.errors.values()), self.coverage.tolist()]
-        rows = [
-            [name, *map(number, errors), "hidden" if name in self.hidden else percent(share)]
-            for name, *errors, share in zip(self.spec.states, *columns, strict=True)
-        ]
-        return parameters + html_table(caption, ["", *self.errors, "in 95 %"], rows)
+        return parameters + html_table(caption, ["", *self.errors, "in 95 %"], self._rows())
 
 
 def identify(
@@ -438,68 +420,30 @@ def identify(
             "Expected states that all move, found exogenous ones or previous values; `smooth` "
             "takes these."
         )
-    share = checked_number("held_out", held_out, above=0, most=0.5)
     checked_whole("seed", seed, 0)
-    longest = max(len(stretch.times) - 1 for stretch in steps)
-    if longest < _LEAST:
-        raise ValueError(
-            f"Expected a stretch of {_LEAST} control steps or more, to hold some out, found "
-            f"{longest}; take a shorter step, or a longer log."
-        )
-    held = max(1, int(share * longest))
+    held = _steps_to_hold_out(steps, held_out)
     f_p = one_physics(physics, spec, "identify one of them")
-    beginnings = []
-    ends = list[int]()
-    for i, stretch in enumerate(steps):
-        end = len(stretch.times)
-        if end - 1 >= 2 * held:
-            end -= held
-            ends.append(i)
-        beginnings.append(stretch.part(slice(end)))
-    learnt_from = Records(beginnings, spec)
+    beginnings, places = _without_ends(steps, held)
     process_noise = None
     if by_free_runs:
         process_noise = torch.full((spec.state_dim,), _NO_NOISE, dtype=torch.float64)
     fit: dict[str, Any] = {"start": start, "sensors": sensors, "num_starts": num_starts}
-    smoothed = smooth(learnt_from, f_p, process_noise=process_noise, **fit)
-    last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
+    smoothed = smooth(beginnings, f_p, process_noise=process_noise, **fit)
+    windows = _ends(steps, smoothed, places, held)
     within = smoothed.chain.within.shape[1]  # steps of the physics in a control step
-    actions, measured = list[Tensor](), list[Tensor]()
-    for i in ends:
-        stretch = steps.records[i]
-        acting = stretch.within if within > 1 else stretch.actions.unsqueeze(1)
-        actions.append(acting[-held - 1 : -1].flatten(0, 1))
-        states = torch.full((held * within, spec.state_dim), torch.nan, dtype=torch.float64)
-        states[within - 1 :: within] = smoothed.corrected(stretch.states)[-held:]
-        measured.append(states)
-    windows = Windows(last, torch.stack(actions), torch.stack(measured))
     length = steps.records[0].sampling_step / within
-    spec = replace(spec, step=length)
-    options: dict[str, Any] = {
-        "start_noise": torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt(),
-        "noise": smoothed.noise.nan_to_num(),
-        "seed": seed,
-    }
-    runs = {}
-    if f_p.unknowns:
-        guesses = PhysicsDynamics(spec, f_p)
-        runs[GUESSES] = guesses.free_run(last, windows.actions, **options)
     # A control step adds the process noise of its steps of the physics.
     process_noise = smoothed.process_noise / math.sqrt(within)
+    noise = smoothed.noise.nan_to_num()
     dynamics = IdentifiedDynamics(
-        spec, f_p, smoothed.physics_parameters, options["noise"], process_noise
+        replace(spec, step=length), f_p, smoothed.physics_parameters, noise, process_noise
     )
-    # Paths of a skewed posterior are skewed about the one by its center, which judges.
-    center = PhysicsParameters(f_p.unknowns, [*dynamics.physics_parameters.center.unsqueeze(-1)])
-    at_center = IdentifiedDynamics(spec, f_p, center, options["noise"], process_noise)
-    path = at_center.free_run(last, windows.actions, noise=False).mean
-    options |= {"process_noise": process_noise, "num_functions": 199}
-    run = dynamics.free_run(last, windows.actions, **options)._replace(mean=path)
-    runs = {IDENTIFIED: run, **runs}
-    remarks = []
+    start_noise = torch.stack([smoothed.sd[i][-1] for i in places]).square().mean(0).sqrt()
+    runs = _free_runs(dynamics, windows, process_noise, start_noise, noise, seed)
+    remarks = advice.on_log(records, length)
     if len(steps) > len(records):
-        remarks = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
-    remarks += [*_of_actions(records, length), *_of_jumps(records), *_of_outliers(records)]
+        text = f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."
+        remarks = [text, *remarks]
     again = None
     if not by_free_runs:
         fit |= {"held_out": held_out, "by_free_runs": True, "seed": seed}
@@ -507,123 +451,71 @@ def identify(
     return Identification(smoothed, dynamics, windows, runs, length, tuple(remarks), again)
 
 
-def _of_actions(records: Records, step: float) -> list[str]:
-    """Return a sentence if actions vary within control steps, over which they are averaged."""
-    size = round(step / records.records[0].sampling_step)
-    if size <= 1:
-        return []
-    shares = []
-    for record in records:
-        steps = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
-        shares.append(steps.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0))
-    if torch.cat(shares).nan_to_num().max() <= _VARIES:
-        return []
-    return [
-        f"The actions vary within a step of {size} samples, over which they are averaged: "
-        "parameters and their intervals may be off. Give an ODEPhysics the step of the samples, "
-        "which follows each action, or take a shorter step and compare."
-    ]
+def _steps_to_hold_out(steps: Records, held_out: float) -> int:
+    """Return the number of control steps that are held out at the end of long stretches."""
+    share = checked_number("held_out", held_out, above=0, most=0.5)
+    longest = max(len(stretch.times) - 1 for stretch in steps)
+    if longest < _LEAST:
+        raise ValueError(
+            f"Expected a stretch of {_LEAST} control steps or more, to hold some out, found "
+            f"{longest}; take a shorter step, or a longer log."
+        )
+    return max(1, int(share * longest))
 
 
-def _of_jumps(records: Records) -> list[str]:
-    """Return sentences on states that jump by a turn."""
-    sentences = []
-    for i, name in enumerate(records.spec.states):
-        if name in records.spec.angles:
-            continue
-        values = torch.cat([record.states[:, i] for record in records])
-        values = values[~values.isnan()]
-        moves = [record.states[:, i].diff() for record in records]
-        for turn, way in _TURNS.items():
-            # An angle that is wrapped has values within a turn, and jumps back as it moves on.
-            if len(values) == 0 or values.max() - values.min() > (1 + _NEAR_A_TURN) * turn:
-                continue
-            is_slow = torch.cat(moves).abs().nanmedian() < 0.1 * turn
-            if is_slow and sum(_returns(move, turn) for move in moves) > 0:
-                sentences.append(f"{name} jumps by a turn: if it is an angle, {way}.")
-    return sentences
+def _without_ends(steps: Records, held: int) -> tuple[Records, list[int]]:
+    """Return stretches without what is held out, and the places of those that are shorter now."""
+    beginnings = []
+    places = []
+    for i, stretch in enumerate(steps):
+        end = len(stretch.times)
+        if end - 1 >= 2 * held:
+            end -= held
+            places.append(i)
+        beginnings.append(stretch.part(slice(end)))
+    return Records(beginnings, steps.spec), places
 
 
-def _of_outliers(records: Records) -> list[str]:
-    """Return sentences on rows that are far off both neighbours, on the same side."""
-    spec = records.spec
-    sentences = []
-    moves = [spec.change(record.states[:-1], record.states[1:]) for record in records]
-    together = torch.cat(moves)
-    # Robust standard deviations of the changes: 1.4826 medians of their sizes
-    far = _OUTLYING * 1.4826 * together.abs().nanmedian(0).values
-    for i, name in enumerate(spec.states):
-        rows = []
-        for record, move in zip(records, moves, strict=True):
-            there, back = move[:-1, i], -move[1:, i]
-            # The nearer neighbour is `far` below, or above
-            off = torch.minimum(there, back).maximum(-torch.maximum(there, back))
-            places = (off > far[i]).nonzero().flatten() + 1
-            rows += [f"{row} of {record.name!r}" for row in places.tolist()]
-        if rows and far[i] > 0:
-            more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
-            sentences.append(
-                f"{name} is far off both neighbours, by more than {_OUTLYING:g} times its usual "
-                f"change, in row {', '.join(rows[:_NAMED])}{more}: one such outlier can spoil all "
-                "estimates. If the sensor failed there, make it NaN."
-            )
-    return sentences
+def _ends(steps: Records, smoothed: SmoothedRecords, places: list[int], held: int) -> Windows:
+    """Return windows of what is held out, in steps of the physics, from the last smoothed states.
+
+    What was measured is corrected by the sensors, and NaN within control steps.
+    """
+    within = smoothed.chain.within.shape[1]
+    actions, measured = list[Tensor](), list[Tensor]()
+    for i in places:
+        stretch = steps.records[i]
+        acting = stretch.actions.unsqueeze(1)
+        if within > 1:
+            acting = stretch.within
+        actions.append(acting[-held - 1 : -1].flatten(0, 1))
+        states = torch.full((held * within, steps.spec.state_dim), torch.nan, dtype=torch.float64)
+        states[within - 1 :: within] = smoothed.corrected(stretch.states)[-held:]
+        measured.append(states)
+    last = torch.stack([smoothed.records.records[i].states[-1] for i in places])
+    return Windows(last, torch.stack(actions), torch.stack(measured))
 
 
-def _returns(moves: Tensor, turn: float) -> float:
-    """Return by how much the moves beside jumps by a turn go against these."""
-    jumps = moves.sign().where((moves.abs() / turn - 1).abs() < _NEAR_A_TURN, 0.0)
-    moves = moves.nan_to_num()
-    return -float((jumps[1:] * moves[:-1]).sum() + (jumps[:-1] * moves[1:]).sum())
-
-
-def _of_parameters(parameters: PhysicsParameters) -> list[str]:
-    """Return sentences on parameters that the log does not tell, or that contradict their prior."""
-    sentences = []
-    for name, unknown in parameters.unknowns.items():
-        off = float(unknown.coordinate(parameters[name]).mean().abs())
-        if off > _FAR:
-            sentences.append(
-                f"{name} is {off:.1f} standard deviations of its prior from its guess: a sign, a "
-                "unit, or a physics that lacks something?"
-            )
-    untold = "The log hardly constrains {}: it stays as known before."
-    return [*sentences, *map(untold.format, parameters.untold)]
-
-
-def _told_together(parameters: PhysicsParameters) -> list[Combination]:
-    """Return the clearest combination of parameters that are only known together, tree by tree."""
-    clear = []
-    numbers = [name for name, unknown in parameters.unknowns.items() if not unknown.function_of]
-    names = [name for name in numbers if (parameters[name] > 0).all()]
-    for first, second in combinations(names, 2):
-        logs = torch.stack([parameters[first], parameters[second]]).log()
-        sd = logs.std(1)
-        if sd.min() == 0 or logs.corrcoef()[0, 1].abs() <= _TOGETHER:
-            continue
-        sizes = [(p * logs[0] + q * logs[1]).std() / math.hypot(p, q) for p, q in _POWERS]
-        least = min(range(len(sizes)), key=sizes.__getitem__)
-        if sizes[least] < _CLEARER * sd.min():
-            clear.append((float(sizes[least] / sd.min()), first, second, _POWERS[least]))
-    combined = []
-    group = {name: name for name in names}
-    for _, first, second, (p, q) in sorted(clear):
-        if group[first] == group[second]:  # it follows from others
-            continue
-        joined = [name for name in names if group[name] == group[second]]
-        group |= dict.fromkeys(joined, group[first])
-        powers = parameters[first] ** p * parameters[second] ** q
-        units = [_bracketed(parameters.unknowns[name].unit) for name in (first, second)]
-        unit = _product(units[0], units[1], p, q) if all(units) else ""
-        combined.append(Combination(_product(first, second, p, q), first, second, unit, powers))
-    return combined
-
-
-def _product(first: str, second: str, p: int, q: int) -> str:
-    """Return such as ``k/J`` and ``k²*J``."""
-    sign = "/" if q < 0 else "*"
-    return f"{first}{'²' * (p == 2)}{sign}{second}{'²' * (abs(q) == 2)}"
-
-
-def _bracketed(unit: str) -> str:
-    return f"({unit})" if {" ", "/"} & {*unit} else unit
+def _free_runs(
+    dynamics: IdentifiedDynamics,
+    windows: Windows,
+    process_noise: Tensor,
+    start_noise: Tensor,
+    noise: Tensor,
+    seed: int,
+) -> dict[str, FreeRun]:
+    """Return free runs along the windows, of the machine and, with parameters, of the guesses."""
+    f_p = dynamics.physics
+    last, actions = windows.initial_states, windows.actions
+    options: dict[str, Any] = {"start_noise": start_noise, "noise": noise, "seed": seed}
+    # Paths of a skewed posterior are skewed about the one by its center, which judges.
+    center = PhysicsParameters(f_p.unknowns, [*dynamics.physics_parameters.center.unsqueeze(-1)])
+    at_center = IdentifiedDynamics(dynamics.spec, f_p, center, noise, process_noise)
+    path = at_center.free_run(last, actions, noise=False).mean
+    run = dynamics.free_run(
+        last, actions, process_noise=process_noise, num_functions=_PARTICLES, **options
+    )
+    runs = {IDENTIFIED: run._replace(mean=path)}
+    if f_p.unknowns:
+        runs[GUESSES] = PhysicsDynamics(dynamics.spec, f_p).free_run(last, actions, **options)
+    return runs

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -34,6 +34,8 @@ _DRAWS = 256  # of the parameters
 _NEARER = math.log(4)  # the most that a logarithm of a variance changes in a round
 _ARRIVED = 0.01  # nats of the log density
 _STILL = 0.1  # nats, a change that is not settled
+_LIKELY = 3.0  # nats, below which another end is about as likely
+_APART = 4.0  # standard deviations of the parameters between ends
 _RIGHT = 0.01  # standard deviations of the states, by which one may be off for good
 
 
@@ -56,6 +58,7 @@ class SmoothedRecords:
         is_settled: Whether the search ended; if not, there was a SmoothingWarning.
         chain: The records as a chain of states, which the physics leads through.
         estimate: Moments of the chain's states, which have the parameters at their end.
+        rival: Parameters ``p`` at which another start ended that is about as likely; None without.
     """
 
     records: Records
@@ -66,6 +69,7 @@ class SmoothedRecords:
     is_settled: bool
     chain: Chain
     estimate: Estimate
+    rival: Tensor | None = None
 
     @property
     def parameters(self) -> PhysicsParameters:
@@ -227,7 +231,7 @@ def smooth(
         elif chain.hidden.any() and chain.unknowns:
             num_starts = 4
     checked_whole("num_starts", num_starts, 1)
-    estimate, is_settled = _estimate(chain, max_rounds, num_starts)
+    estimate, is_settled, rival = _estimate(chain, max_rounds, num_starts)
     covariances = np.concatenate([part.states.covariances for part in estimate.stretches])
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0))
     noises = np.sqrt(estimate.variances)
@@ -243,6 +247,7 @@ def smooth(
         is_settled,
         chain,
         estimate,
+        rival,
     )
 
 
@@ -276,8 +281,10 @@ def _with_states(steps: Records, path: Array) -> Records:
     return Records(records, steps.spec)
 
 
-def _estimate(chain: Chain, max_rounds: int, num_starts: int) -> tuple[Estimate, bool]:
-    """Find the most likely states, parameters and variances, and whether the search settled."""
+def _estimate(
+    chain: Chain, max_rounds: int, num_starts: int
+) -> tuple[Estimate, bool, Tensor | None]:
+    """Find the most likely states, parameters and variances, if the search settled, and a rival."""
     ends = list[tuple[Estimate, float]]()
     with long_work("smooth", "rounds", total=num_starts * max_rounds):
         for i, (coordinates, known_at_once) in enumerate(chain.starts_of_search(num_starts)):
@@ -307,7 +314,22 @@ def _estimate(chain: Chain, max_rounds: int, num_starts: int) -> tuple[Estimate,
             "these states. `smooth` also has max_rounds, noise and process_noise.",
             SmoothingWarning,
         )
-    return best, is_settled
+    settled = [estimate for estimate, gained in arrived if abs(gained) <= _STILL]
+    return best, is_settled, _rival(chain, best, settled)
+
+
+def _rival(chain: Chain, best: Estimate, ends: Sequence[Estimate]) -> Tensor | None:
+    """Return parameters at the likeliest end that is apart from the best, and not unlikelier."""
+    theta = slice(chain.d, None)
+    moments = best.stretches[0].states
+    mean, covariance = moments.means[0, theta], moments.covariances[0, theta, theta]
+    for end in sorted(ends, key=lambda end: -end.log_density):
+        off = end.states[0, theta] - mean
+        # (theta' - theta)' C^-1 (theta' - theta)
+        square = off @ np.linalg.solve(covariance, off)
+        if best.log_density - end.log_density < _LIKELY and square > _APART**2:
+            return chain.unknowns.to_values(torch.from_numpy(end.states[0, theta].copy()))
+    return None
 
 
 def _search(

@@ -10,7 +10,7 @@ import torch
 from gpadjust.control import MPC, Planner
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, identify
-from gpadjust.records.identification import _of_jumps, _of_outliers
+from gpadjust.records.advice import on_outliers, on_turns
 from gpadjust.states import StateSpec
 
 STEP, TRUE = 0.1, 2.25
@@ -185,10 +185,10 @@ def test_an_angle_that_jumps_by_a_turn_is_said():
         angle = (0.1 * turn * t + 0.4 * turn) % turn
         states = torch.stack([angle, torch.full_like(t, torch.nan)], -1)
         records = Records(Record(t, states, torch.zeros_like(states[:, :1])), SPEC)
-        assert _of_jumps(records) == [
+        assert on_turns(records) == [
             f"x jumps by a turn: if it is an angle, {way}add it to `angles`."
         ]
-        assert not _of_jumps(Records(records.records, angled))
+        assert not on_turns(Records(records.records, angled))
 
 
 def test_a_row_that_is_far_off_both_neighbours_is_said():
@@ -198,17 +198,17 @@ def test_a_row_that_is_far_off_both_neighbours_is_said():
     states[9:, 1] += 50.0  # a jump, which stays, and a gap
     states[20, 1] = torch.nan
     records = Records(Record(good.times, states, good.actions, name="arm"), SPEC)
-    (sentence,) = _of_outliers(records)
+    (sentence,) = on_outliers(records)
     assert sentence.startswith("x is far off both neighbours")
     assert "in row 7 of 'arm': one such" in sentence
-    assert not _of_outliers(Records(good, SPEC))
+    assert not on_outliers(Records(good, SPEC))
     # Counts of an encoder that stand still most of the time; an angle, at half a turn.
     counts = states.new_zeros(121, 2)
     counts[::10, 0] = 1.0
     counts[:, 1] = math.pi - 0.01
     counts[::2, 1] *= -1
     angled = StateSpec(["x", "v"], ["u"], angles=["v"], step=STEP)
-    assert not _of_outliers(Records(Record(good.times, counts, good.actions), angled))
+    assert not on_outliers(Records(Record(good.times, counts, good.actions), angled))
 
 
 def test_a_speed_that_steps_by_360_has_no_turns():
@@ -219,7 +219,7 @@ def test_a_speed_that_steps_by_360_has_no_turns():
     for speed in (rises, swings):
         assert ((speed.diff().abs() / 360 - 1).abs() < 0.12).any()
         states = torch.stack([speed, torch.full_like(t, torch.nan)], -1)
-        assert not _of_jumps(Records(Record(t, states, torch.zeros_like(states[:, :1])), SPEC))
+        assert not on_turns(Records(Record(t, states, torch.zeros_like(states[:, :1])), SPEC))
 
 
 @pytest.mark.slow
