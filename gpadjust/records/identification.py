@@ -44,7 +44,7 @@ _NO_NOISE = 1e-100  # standard deviation: the smoother takes the least that it c
 _LEAST = 8  # steps of a stretch, of which the last part is held out
 _MORE = 0.1  # of the measurements in intervals: clearly more
 _BLOCKS = 5  # of a window, whose errors are compared
-_JUMPY = 0.01  # of the steps: more jumps make a search end where it is
+_JUMPY = 0.005  # of the steps: more jumps make a search end where it is
 _LARGE = 2.0  # times the noise of the sensor: an error that something missing may have made
 
 _UNSETTLED = (

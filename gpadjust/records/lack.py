@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor
 from gpadjust.display import Display
 from gpadjust.records import kalman
 from gpadjust.records.chain import Chain, Estimate
-from gpadjust.records.kalman import Array, Link
+from gpadjust.records.kalman import Array, Link, Smoothed
 from gpadjust.states import StateSpec
 
 _CHANCE = 0.01  # that a right equation lacks something
@@ -25,19 +26,16 @@ _FEW_BINS = 4  # of a test
 _BINS = 8  # of a figure
 _IN_BIN = 8  # steps, at least
 _LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps
+_SMOOTH_SIGN = 0.05  # of the usual size: the width of a smooth sign
 _WIDE = 10.0  # times the changes per time: what may be missing
 _FORCE = 2.0  # times the process noise: a force that may be missing
 _LENGTH = 0.5  # lengthscale of a force that may be missing, in ranges of a state
 _SMOOTH = 4  # functions of a force that may be missing
-_ROUNDS = 20  # of expectation maximisation
 _KINEMATIC = 0.03  # of a state's changes, by which they differ from the integral of another
 _BOTH_SIGNS = 0.05  # the least share of either sign
-_EXPLAINED = 0.5  # of what bins explain: a term that is short enough for a sentence
 
 _TERMS = {
     "constant": "",
-    "line": "*{0}",
-    "square": "*{0}**2",
     "sign": "*sign({0})",
     "drag": "*{0}*abs({0})",
     "sin": "*sin({0})",
@@ -80,7 +78,11 @@ class Lack(Display):
             return f"{self.state}' lacks about {self.term} throughout: try an offset."
         if self.term:
             kind = _KINDS.get((self.shape, self.state == self.over), "")
-            return f"{self.state}' lacks about {self.term}{kind}: try such a term."
+            text = f"{self.state}' lacks about {self.term}{kind}: try such a term."
+            if self.shape == "sign":  # a jump spoils slopes, and so the search
+                width = _SMOOTH_SIGN * self.at.square().mean().sqrt()
+                text += f" Write F*tanh({self.over}/{width:.1g}) for it, with F unknown."
+            return text
         low, high = self.means.min(), self.means.max()
         return (
             f"{self.state}' lacks {low:.2g} to {high:.2g}, depending on {self.over}: the figure of "
@@ -88,34 +90,33 @@ class Lack(Display):
         )
 
 
-class _Candidate(NamedTuple):
-    """What the residual of equation ``i`` may depend on: columns ``N x K``, of a lag or bins."""
+class _Effect(NamedTuple):
+    """What equation ``i`` may lack over a state or an action."""
 
     i: int
     over: str
-    values: Array  # N, or with the lags N x 6
+    shape: str | float  # such as "sign"; of a lag its number of steps
+    at: Array  # N, of the state or the action; of a lag the delayed action less the action
     columns: Array  # N x K
-    is_lag: bool
 
 
 def clearest_lack(chain: Chain, estimate: Estimate, step: float) -> Lack | None:
     """Return what the equations lack most clearly; None if nothing is clear.
 
-    What bins of a state add to an equation are constants of the chain of states, beside the
-    parameters, which may be anywhere. They are clear if their chi-square is beyond chance, and if
-    either half of each stretch tells the same: what moves the machine for a while, whatever the
-    states are, does not. Equations of a state whose rate is another state are left out.
+    What a term, bins of a state or a lag add to an equation are constants of the chain of states,
+    in addition to the parameters, which may be anywhere. They are clear if their chi-square is
+    beyond chance, and if either half of each stretch tells the same: what moves the machine for a
+    while, whatever the states are, does not. Equations of a state whose rate is another state are
+    left out.
     """
     search = _Search(chain, estimate, step)
-    candidates = [*search.candidates()]
-    if not candidates:
+    tests = [(*search.test(effect), effect) for effect in search.effects()]
+    if not tests:
         return None
-    best = min(candidates, key=lambda candidate: search.tested(candidate).chance)
-    search.explain(best)  # the process noise estimated without it hid some of it
-    result = search.tested(best)
-    if result.chance + math.log(len(candidates)) > math.log(_CHANCE) or result.again < _AGAIN:
+    chance, again, effect = min(tests, key=lambda test: test[0])
+    if chance + math.log(len(tests)) > math.log(_CHANCE) or again < _AGAIN:
         return None
-    return search.described(best, result.gain)
+    return search.described(effect)
 
 
 def robust_moments(chain: Chain, estimate: Estimate, step: float) -> tuple[Array, Array]:
@@ -139,28 +140,24 @@ def robust_moments(chain: Chain, estimate: Estimate, step: float) -> tuple[Array
             # k = V diag(w) V', of which a few columns V sqrt(w) are nearly all
             w, V = np.linalg.eigh(np.exp(-0.5 * off**2))
             root = V[:, -_SMOOTH:] * np.sqrt(w[-_SMOOTH:].clip(0))
-            added.append(search._added(i, size * columns @ root))
+            added.append(search.added(i, size * columns @ root))
     d, p = chain.d, chain.num_parameters
     if not added:
         moments = estimate.stretches[0].states
         return moments.means[0, d:], moments.covariances[0, d:, d:]
-    joined = [np.concatenate(parts, -1) for parts in zip(*added, strict=True)]
-    K = joined[0].shape[-1]
-    starts = [
-        (np.append(x, np.zeros(K)), block_diag(spread, np.eye(K))) for x, spread in chain.starts
-    ]
-    links = [*map(_with, search.links, joined)]
-    stretches, _ = kalman.smooth_chain(links, starts, *search.variances)
-    mean, covariance = (part[0] for part in stretches[0].states)
+    columns = [np.concatenate(parts, -1) for parts in zip(*added, strict=True)]
+    fit = search.fitted(search.links, chain.starts, columns, 1.0)
+    mean, covariance = (part[0] for part in fit.stretches[0].states)
     return mean[d : d + p], covariance[d : d + p, d : d + p]
 
 
-class _Test(NamedTuple):
-    """If a residual is clear: the log of its chance, what one half tells by the other, nats."""
+class _Fit(NamedTuple):
+    """A chain with further constants, smoothed, and mean and covariance of these."""
 
-    chance: float
-    again: float
-    gain: float
+    links: list[Link]
+    stretches: list[Smoothed]
+    mean: Array
+    covariance: Array
 
 
 class _Search:
@@ -193,8 +190,8 @@ class _Search:
             if self.wide[i] > 0 and not is_rate:
                 self.equations.append(i)
 
-    def candidates(self) -> Iterator[_Candidate]:
-        """Yield bins of all states and actions, and lags of the actions, for each equation."""
+    def effects(self) -> Iterator[_Effect]:
+        """Yield bins and terms of all states and actions, and lags of the actions."""
         spec = self.chain.spec
         values = {spec.states[i]: self.middle[:, k] for k, i in enumerate(spec.moving)}
         actions = self.chain.recorded[self.chain.now, spec.state_dim :].numpy()
@@ -202,19 +199,23 @@ class _Search:
         for name in spec.angles:
             values[name] = np.arctan2(np.sin(values[name]), np.cos(values[name]))
         for i in self.equations:
-            for name, column in values.items():
-                columns = _bins(column, _FEW_BINS)
-                if columns.shape[1] > 1:
-                    yield _Candidate(i, name, column, columns, is_lag=False)
-                if _has_both_signs(column):  # one column is told from chance by less than bins
-                    for term in (np.sign(column), column * np.abs(column)):
-                        single = term[:, None] / np.sqrt((term**2).mean())
-                        yield _Candidate(i, name, column, single, is_lag=False)
-            for name in spec.actions:
-                late = np.stack([self._late(values[name], lag) for lag in _LAGS], -1)
-                size = np.sqrt((late**2).mean(0))
-                if size.min() > 0 and len(self.middle) >= _IN_BIN * len(_LAGS):
-                    yield _Candidate(i, name, late, late / size, is_lag=True)
+            for over, x in values.items():
+                bins = _bins(x, _FEW_BINS)
+                if bins.shape[1] == 1:
+                    continue
+                terms = {"bins": bins}
+                if over == spec.states[spec.moving[i]]:
+                    terms["constant"] = np.ones_like(x)
+                if _BOTH_SIGNS < (x > 0).mean() < 1 - _BOTH_SIGNS:
+                    terms |= {"sign": np.sign(x), "drag": x * np.abs(x)}
+                if over in spec.angles:
+                    terms |= {"sin": np.sin(x), "cos": np.cos(x)}
+                for shape, term in terms.items():
+                    yield _Effect(i, over, shape, x, term.reshape(len(x), -1))
+            for over, lag in product(spec.actions, _LAGS):
+                late = self._late(values[over], lag)
+                if late.any() and len(late) >= _IN_BIN * len(_LAGS):
+                    yield _Effect(i, over, lag, late, late[:, None])
 
     def _late(self, action: Array, lag: float) -> Array:
         """Return an action behind a lag of first order, in steps, less the action itself."""
@@ -226,148 +227,98 @@ class _Search:
             end += length
         return late - action
 
-    def explain(self, by: _Candidate) -> None:
-        """Take the variances that are most likely with columns beside the equations."""
-        links = [*map(_with, self.links, self._added(by.i, by.columns))]
-        starts = self._starts(self.chain.starts, by.i, by.columns.shape[1])
-        for _ in range(_ROUNDS):
-            stretches, _ = kalman.smooth_chain(links, starts, *self.variances)
-            noise, added = kalman.expected_squares(links, stretches, self.chain.d)
-            mean_noise = np.nansum(noise, 0) / (~np.isnan(noise)).sum(0).clip(1)
-            likely = self.chain.checked(np.stack([mean_noise, added.mean(0)]))
-            likely[0, self.chain.hidden] = self.variances[0, self.chain.hidden]
-            self.variances = likely * np.sqrt(likely / self.variances)  # and a little further
+    def test(self, effect: _Effect) -> tuple[float, float]:
+        """Test if an effect is beyond chance, and again in the other half of the stretches.
 
-    def tested(self, candidate: _Candidate) -> _Test:
-        """Test whether what columns add is beyond chance, and again in the other half."""
-        precision, pull = self.halves(candidate)
-        prior = np.eye(len(pull[0])) / self.wide[candidate.i] ** 2
-        halves = np.linalg.solve(precision + prior, pull[..., None])[..., 0]
-        # a_k' Lambda_l a_k and a_k' h_l, by the estimate a_k of one half and the other half l: the
-        # ratio is standard normal if both have nothing in common.
-        sizes = [halves[k] @ precision[1 - k] @ halves[k] for k in (0, 1)]
-        products = [halves[k] @ pull[1 - k] for k in (0, 1)]
-        again = min(products[k] / math.sqrt(max(sizes[k], 1e-300)) for k in (0, 1))
-        # chi^2 = h' (Lambda + P^-1)^-1 h
-        h = pull.sum(0)
-        square = float(h @ np.linalg.solve(precision.sum(0) + prior, h))
-        return _Test(float(chi2.logsf(square, len(h))), float(again), square / 2)
-
-    def halves(self, of: _Candidate) -> tuple[Array, Array]:
-        """Return precision, ``2 x K x K``, and pull, ``2 x K``, by both halves of the stretches."""
-        K = of.columns.shape[1]
-        prior = np.eye(K) / self.wide[of.i] ** 2
+        Return the log of its chance, and what one half tells by the other.
+        """
+        i = effect.i
+        K = effect.columns.shape[1]
+        prior = np.eye(K) / self.wide[i] ** 2
         precision = np.zeros((2, K, K))
         pull = np.zeros((2, K))
-        triples = zip(self.links, self._added(of.i, of.columns), self.chain.firsts, strict=True)
+        added = self.added(i, effect.columns / np.sqrt((effect.columns**2).mean(0)))
         anywhere = np.diag(np.append(self.chain.first_variance, [_WIDE**2] * len(self.theta)))
-        for link, added, first in triples:
-            cut = len(added) // 2
-            for k, part in enumerate((slice(0, cut), slice(cut, len(added)))):
+        for link, of_link, first in zip(self.links, added, self.chain.firsts, strict=True):
+            cut = len(of_link) // 2
+            for k, part in enumerate((slice(0, cut), slice(cut, len(of_link)))):
                 if part.stop == part.start:
                     continue
-                end = part.stop + 1
-                rows = slice(part.start, end)
+                rows = slice(part.start, part.stop + 1)
                 outputs, measured = link.outputs[rows], link.measured[rows]
                 shorter = Link(link.matrices[part], link.offsets[part], outputs, measured)
                 start = [(self.estimate.states[first + part.start], anywhere)]
-                mean, covariance, *_ = self._smoothed([shorter], [added[part]], start, of.i)
-                inverse = np.linalg.inv(covariance)
+                fit = self.fitted([shorter], start, [of_link[part]], self.wide[i])
+                inverse = np.linalg.inv(fit.covariance)
                 precision[k] += inverse - prior
-                pull[k] += inverse @ mean
-        return precision, pull
+                pull[k] += inverse @ fit.mean
+        # chi^2 = h' (Lambda + P^-1)^-1 h
+        h = pull.sum(0)
+        square = float(h @ np.linalg.solve(precision.sum(0) + prior, h))
+        # a_k' Lambda_l a_k and a_k' h_l, by the estimate a_k of one half and the other half l: the
+        # ratio is standard normal if both have nothing in common.
+        a = np.linalg.solve(precision + prior, pull[..., None])[..., 0]
+        sizes = [math.sqrt(max(a[k] @ precision[1 - k] @ a[k], 1e-300)) for k in (0, 1)]
+        again = min(float(a[k] @ pull[1 - k]) / sizes[k] for k in (0, 1))
+        return _log_chance(square, K), again
 
-    def described(self, of: _Candidate, gained: float) -> Lack:
-        """Return the residual in bins beside parameters that suit the term that explains it."""
-        i, d = of.i, self.chain.d
-        starts = self.chain.starts
-        best: tuple[float, str, Array, float, Array]
-        best = (-math.inf, "", of.values, 0.0, self.theta)
-        _, _, without, *_ = self._smoothed(self.links, None, starts, i)
-        for shape, column in self._terms(of):
-            size = np.sqrt((column**2).mean())
-            added = self._added(i, column[:, None] / size)
-            mean, _, density, parameters, _ = self._smoothed(self.links, added, starts, i)
-            if density > best[0]:
-                best = (density, shape, column, float(mean[0]) / size, parameters)
-        density, shape, column, factor, theta = best
-        # A wide prior costs a term what it does not cost the bins.
-        if not of.is_lag and density - without < _EXPLAINED * gained - math.log(_WIDE):
-            shape = ""
-            theta = self.theta
-        at = column if of.is_lag else of.values
-        columns = _bins(at, _BINS)
-        added = self._added(i, columns)
-        links = [_at(link, d, theta) for link in self.links]
-        alone = [(mean[:d], spread[:d, :d]) for mean, spread in starts]
-        mean, covariance, _, _, left = self._smoothed(links, added, alone, i)
-        residual = columns @ mean + left / self.pushes[:, i, i]
-        middles = np.array([np.median(at[column > 0]) for column in columns.T])
-        lag = None
-        term = ""
-        if of.is_lag:
-            lag = _LAGS[int(shape)] * self.step
-        elif shape:
-            term = f"{factor:.2g}{_TERMS[shape].format(of.over)}"
+    def described(self, effect: _Effect) -> Lack:
+        """Return the residual in bins, by parameters that suit the effect."""
+        i, over, shape, at, columns = effect
+        d = self.chain.d
+        fit = self.fitted(self.links, self.chain.starts, self.added(i, columns), self.wide[i])
+        theta = fit.stretches[0].states.means[0, d : d + len(self.theta)]
         spec = self.chain.spec
+        lag = None
+        name = term = ""
+        if isinstance(shape, float):
+            lag = shape * self.step
+        elif shape != "bins":
+            name = shape
+            term = f"{fit.mean[0]:.2g}{_TERMS[shape].format(over)}"
+        bins = _bins(at, _BINS)
+        links = [_at(link, d, theta) for link in self.links]
+        alone = [(mean[:d], spread[:d, :d]) for mean, spread in self.chain.starts]
+        fit = self.fitted(links, alone, self.added(i, bins), self.wide[i])
+        left = []
+        for link, (states, _) in zip(fit.links, fit.stretches, strict=True):
+            ahead = np.einsum("tj,tj->t", link.matrices[:, i], states.means[:-1])
+            left.append(states.means[1:, i] - ahead - link.offsets[:, i])
+        residual = bins @ fit.mean + np.concatenate(left) / self.pushes[:, i, i]
+        middles = np.array([np.median(at[column > 0]) for column in bins.T])
         state = spec.states[spec.moving[i]]
-        numbers = (at, residual, middles, mean, np.sqrt(np.diag(covariance)))
-        return Lack(spec, state, of.over, term, shape, lag, *map(torch.from_numpy, numbers))
+        numbers = (at, residual, middles, fit.mean, np.sqrt(np.diag(fit.covariance)))
+        return Lack(spec, state, over, term, name, lag, *map(torch.from_numpy, numbers))
 
-    def _terms(self, of: _Candidate) -> Iterator[tuple[str, Array]]:
-        """Yield names and values of simple terms, ``N``, of which one may be what is missing."""
-        if of.is_lag:
-            yield from ((str(k), late) for k, late in enumerate(of.values.T))
-            return
-        x = of.values
-        yield from (("constant", np.ones_like(x)), ("line", x), ("square", x**2))
-        if _has_both_signs(x):
-            yield from (("sign", np.sign(x)), ("drag", x * np.abs(x)))
-        if of.over in self.chain.spec.angles:
-            yield from (("sin", np.sin(x)), ("cos", np.cos(x)))
-
-    def _added(self, i: int, columns: Array) -> list[Array]:
+    def added(self, i: int, columns: Array) -> list[Array]:
         """Return what columns ``N x K`` in equation i add to all states, for each stretch."""
         added = self.pushes[:, :, i, None] * columns[:, None]
         return np.split(added, np.cumsum(self.lengths)[:-1])
 
-    def _starts(
-        self, starts: list[tuple[Array, Array]], i: int, K: int
-    ) -> list[tuple[Array, Array]]:
-        """Return starts with further constants, of which nothing is known."""
-        wide = self.wide[i] ** 2 * np.eye(K)
-        return [(np.append(x, np.zeros(K)), block_diag(spread, wide)) for x, spread in starts]
-
-    def _smoothed(
+    def fitted(
         self,
         links: list[Link],
-        added: list[Array] | None,
         starts: list[tuple[Array, Array]],
-        i: int,
-    ) -> tuple[Array, Array, float, Array, Array]:
-        """Smooth a chain with further constants.
-
-        Return their mean and covariance, the log density, the constants before them, and what the
-        steps add to state i beyond all.
-        """
-        K = 0
-        if added is not None:
-            K = added[0].shape[2]
-            links = [*map(_with, links, added)]
-        wider = self._starts(starts, i, K)
-        stretches, density = kalman.smooth_chain(links, wider, *self.variances)
-        left = []
-        for link, (states, _) in zip(links, stretches, strict=True):
-            ahead = np.einsum("tj,tj->t", link.matrices[:, i], states.means[:-1])
-            left.append(states.means[1:, i] - ahead - link.offsets[:, i])
+        added: list[Array],
+        sd: Array | float,
+    ) -> _Fit:
+        """Smooth a chain with further constants, which are about 0 with this standard deviation."""
+        K = added[0].shape[-1]
+        prior = sd**2 * np.eye(K)
+        links = [*map(_with, links, added)]
+        wider = [(np.append(x, np.zeros(K)), block_diag(spread, prior)) for x, spread in starts]
+        stretches, _ = kalman.smooth_chain(links, wider, *self.variances)
         mean, covariance = (part[0] for part in stretches[0].states)
-        k = len(mean) - K
-        constants = mean[self.chain.d : k]
-        return mean[k:], covariance[k:, k:], density, constants, np.concatenate(left)
+        return _Fit(links, stretches, mean[-K:], covariance[-K:, -K:])
 
 
-def _has_both_signs(values: Array) -> bool:
-    return bool(_BOTH_SIGNS < (values > 0).mean() < 1 - _BOTH_SIGNS)
+def _log_chance(square: float, K: int) -> float:
+    """Return the log probability of a larger chi-square; of large ones to first order."""
+    chance = float(chi2.logsf(square, K))
+    if chance > -math.inf:
+        return chance
+    # z^(a - 1) exp(-z) / Gamma(a) for z = chi^2 / 2, a = K / 2
+    return (K / 2 - 1) * math.log(square / 2) - square / 2 - math.lgamma(K / 2)
 
 
 def _bins(values: Array, most: int) -> Array:

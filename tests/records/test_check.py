@@ -76,3 +76,15 @@ def test_what_no_action_moves_is_not_told_and_an_input_is_named():
     calls.clear()
     check_log(log(np.random.default_rng(1).uniform(-1, 1, ROWS)), physics)
     assert sum(calls) <= 10 * 2 * ROWS  # evaluations of f_p in all, for two parameters
+
+
+def test_an_input_that_tells_a_sum_alone_is_not_named():
+    """Each of two parameters moves the measurements with such an input, and neither is known."""
+
+    def summed(X, p):
+        return (0.9 * X[:, 0] + (p.a + p.b) * X[:, 1]).unsqueeze(-1)
+
+    physics = FunctionPhysics(summed, unknowns={"a": B, "b": B})
+    for direction in check_log(log(np.zeros(ROWS)), physics):
+        assert direction.value < 1e-3
+        assert direction.input == "None of the inputs that were tried does."

@@ -86,7 +86,11 @@ def test_dry_friction_is_found_over_the_rate(dry):
     assert (lack.state, lack.over, lack.shape) == ("rate", "rate", "sign")
     factor = float(lack.term.removesuffix("*sign(rate)"))
     assert factor == pytest.approx(-FRICTION, rel=0.2)
-    assert f"rate' lacks about {lack.term}, as of dry friction: try such a term." in dry.advice
+    sentence = (
+        f"rate' lacks about {lack.term}, as of dry friction: try such a term. "
+        "Write F*tanh(rate/0.06) for it, with F unknown."
+    )
+    assert sentence in dry.advice
     off = lack.means + FRICTION * lack.middles.sign()
     clear = lack.middles.abs() > 0.3  # not where the rate changes its sign within a step
     assert (off[clear].abs() < 3 * lack.sd[clear]).all()
