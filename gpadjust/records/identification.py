@@ -324,21 +324,23 @@ class Identification(Display):
     def __repr__(self) -> str:
         """Tables of parameters, combinations, noises, and errors of free runs."""
         steps = sum(len(record.times) - 1 for record in self.smoothed.records)
-        windows, held = self.windows.measured.shape[:2]
-        head = f"Identification by {plural(steps, 'step')}, {windows * held:,} held out"
-        tables = [repr(self.parameters), repr(self.combinations)]
-        if self.parameters is None:
-            tables = []
-        elif not self.combinations:
-            tables = tables[:1]
+        windows, length = self.windows.measured.shape[:2]
+        held = windows * round(length * self.step / self._control_step)
+        head = f"Identification by {plural(steps, 'step')}, {held:,} held out"
+        tables = []
+        if self.parameters is not None:
+            tables.append(repr(self.parameters))
+        if self.combinations:
+            tables.append(repr(self.combinations))
         columns = ["", "noise", "process noise", *(f"error, {name}" for name in self.errors)]
-        rows = [
-            [name, number(noise), number(process_noise), *texts]
-            for noise, process_noise, (name, *texts) in zip(
-                self.smoothed.noise, self.smoothed.process_noise, self._rows(), strict=True
-            )
-        ]
-        return "\n".join([head, *tables, text_table([[*columns, "in 95 %"], *rows])])
+        rows = [[*columns, "in 95 %"]]
+        noises = zip(self.smoothed.noise, self.smoothed.process_noise, strict=True)
+        for (noise, process_noise), (name, *texts) in zip(noises, self._rows(), strict=True):
+            sensor = number(noise)
+            if name in self.hidden:
+                sensor = "hidden"
+            rows.append([name, sensor, number(process_noise), *texts])
+        return "\n".join([head, *tables, text_table(rows)])
 
     def _rows(self) -> list[list[str]]:
         """Return rows of the states' names, errors of free runs, and shares in the intervals."""

@@ -145,8 +145,8 @@ def robust_moments(chain: Chain, estimate: Estimate, step: float) -> tuple[Array
     if not added:
         moments = estimate.stretches[0].states
         return moments.means[0, d:], moments.covariances[0, d:, d:]
-    columns = [np.concatenate(parts, -1) for parts in zip(*added, strict=True)]
-    fit = search.fitted(search.links, chain.starts, columns, 1.0)
+    together = [np.concatenate(parts, -1) for parts in zip(*added, strict=True)]
+    fit = search.fitted(search.links, chain.starts, together, 1.0)
     mean, covariance = (part[0] for part in fit.stretches[0].states)
     return mean[d : d + p], covariance[d : d + p, d : d + p]
 

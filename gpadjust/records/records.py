@@ -19,6 +19,7 @@ from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.files.fields import is_moment, seconds_of
 from gpadjust.files.table import Table
 from gpadjust.states import StateSpec
+from gpadjust.words import plural
 
 _GAP = 1.5  # typical steps: a longer time between two rows is a gap
 _OFTEN = 0.1  # share of the times between rows above which they are not gaps, but uneven
@@ -108,7 +109,7 @@ class Record:
         states, actions = self.states.shape[1], self.actions.shape[1]
         return (
             f"Record({self.name!r}, {len(self.times)} rows every {self.sampling_step:.4g}, "
-            f"{states} state{'s' * (states > 1)}, {actions} action{'s' * (actions > 1)})"
+            f"{plural(states, 'state')}, {plural(actions, 'action')})"
         )
 
     def part(self, rows: slice) -> Record:
@@ -149,8 +150,12 @@ class Record:
     def _numbers(self, values: ArrayLike, name: str, dims: int) -> Tensor:
         tensor = as_tensor(values, name).detach().clone()
         if tensor.dim() != dims or 0 in tensor.shape[1:]:
-            expected = f"N x {name.removesuffix('s')}_dim" if dims > 1 else "N"
-            way_out = "; of a single column, use `.reshape(-1, 1)`" * (dims > tensor.dim())
+            expected = "N"
+            if dims > 1:
+                expected = f"N x {name.removesuffix('s')}_dim"
+            way_out = ""
+            if dims > tensor.dim():
+                way_out = "; of a single column, use `.reshape(-1, 1)`"
             raise self._error(
                 f": expected {name} of shape {expected}, got {tuple(tensor.shape)}{way_out}."
             )

@@ -61,7 +61,14 @@ def test_parameters_noise_and_a_free_run_that_errs_by_the_noise(found):
     assert all(error[1] != error[1] for error in errors.values())  # nobody knows
     assert found.coverage[0] > 0.85
     assert found.advice == []
-    assert "guesses: " in repr(found)
+    head, names, stiffness, columns, position, rate = repr(found).splitlines()
+    assert head == "Identification by 90 steps, 30 held out"
+    assert names.split() == ["mean", "95", "%", "interval", "prior", "unit"]
+    assert stiffness.endswith("1.5, factor 1.5  1/s²")
+    assert columns.split("  ")[-1] == "in 95 %"
+    assert [*errors][:2] == ["identified", "guesses"]
+    assert position.split()[3:5] == [f"{error[0]:.3g}" for error in [*errors.values()][:2]]
+    assert rate.split()[:2] == ["v", "hidden"]
 
 
 @pytest.mark.slow

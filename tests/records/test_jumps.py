@@ -90,17 +90,14 @@ def of_either_sign():
     """A decay whose rate is a square."""
 
     def decays(X, p):
-        return (1 - 0.1 * p.root**2) * X
+        return ((1 - 0.1 * p.root**2) * X[:, 0]).unsqueeze(-1)
 
     t = torch.arange(60, dtype=torch.float64)
-    x = 0.96 ** t.unsqueeze(-1) + 1e-3 * torch.randn(60, 1, generator=generator(0)).double()
+    generator = torch.Generator().manual_seed(0)
+    x = 0.96 ** t.unsqueeze(-1) + 1e-3 * torch.randn(60, 1, generator=generator).double()
     records = Records(Record(t, x, torch.zeros_like(x)), StateSpec(["x"], ["none"]))
     prior = Unknown(0.2, sd=0.6)  # the truth is 0.63, or less likely -0.63
-    return records, FunctionPhysics(lambda X, p: decays(X[:, :1], p), unknowns={"root": prior})
-
-
-def generator(seed):
-    return torch.Generator().manual_seed(seed)
+    return records, FunctionPhysics(decays, unknowns={"root": prior})
 
 
 def test_an_end_as_likely_as_the_best_is_a_rival(of_either_sign):

@@ -86,9 +86,11 @@ def test_dry_friction_is_found_over_the_rate(dry):
     assert (lack.state, lack.over, lack.shape) == ("rate", "rate", "sign")
     factor = float(lack.term.removesuffix("*sign(rate)"))
     assert factor == pytest.approx(-FRICTION, rel=0.2)
+    (record,) = dry.smoothed.records
+    width = 0.05 * record.states[:, 1].square().mean().sqrt()
     sentence = (
         f"rate' lacks about {lack.term}, as of dry friction: try such a term. "
-        "Write F*tanh(rate/0.06) for it, with F unknown."
+        f"Write F*tanh(rate/{width:.1g}) for it, with F unknown."
     )
     assert sentence in dry.advice
     off = lack.means + FRICTION * lack.middles.sign()
