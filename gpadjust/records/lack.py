@@ -29,6 +29,7 @@ _LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps
 _SMOOTH_SIGN = 0.05  # of the usual size: the width of a smooth sign
 _WIDE = 10.0  # times the changes per time: what may be missing
 _FORCE = 2.0  # times the process noise: a force that may be missing
+_ROUNDS = 20  # of expectation maximisation
 _LENGTH = 0.5  # lengthscale of a force that may be missing, in ranges of a state
 _SMOOTH = 4  # functions of a force that may be missing
 _KINEMATIC = 0.03  # of a state's changes, by which they differ from the integral of another
@@ -116,6 +117,7 @@ def clearest_lack(chain: Chain, estimate: Estimate, step: float) -> Lack | None:
     chance, again, effect = min(tests, key=lambda test: test[0])
     if chance + math.log(len(tests)) > math.log(_CHANCE) or again < _AGAIN:
         return None
+    search.explain(effect)  # the process noise estimated without it has some of it
     return search.described(effect)
 
 
@@ -261,6 +263,17 @@ class _Search:
         sizes = [math.sqrt(max(a[k] @ precision[1 - k] @ a[k], 1e-300)) for k in (0, 1)]
         again = min(float(a[k] @ pull[1 - k]) / sizes[k] for k in (0, 1))
         return _log_chance(square, K), again
+
+    def explain(self, effect: _Effect) -> None:
+        """Take the variances that are most likely with an effect in addition to the equations."""
+        added = self.added(effect.i, effect.columns)
+        for _ in range(_ROUNDS):
+            fit = self.fitted(self.links, self.chain.starts, added, self.wide[effect.i])
+            noise, process_noise = kalman.expected_squares(fit.links, fit.stretches, self.chain.d)
+            mean_noise = np.nansum(noise, 0) / (~np.isnan(noise)).sum(0).clip(1)
+            likely = self.chain.checked(np.stack([mean_noise, process_noise.mean(0)]))
+            likely[0, self.chain.hidden] = self.variances[0, self.chain.hidden]
+            self.variances = likely * np.sqrt(likely / self.variances)  # and a little further
 
     def described(self, effect: _Effect) -> Lack:
         """Return the residual in bins, by parameters that suit the effect."""
