@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Sized
 
 from torch import Tensor
 
@@ -59,15 +59,13 @@ def noted(text: str, note: str) -> str:
     return f"{text} ({note})" if note else text
 
 
-def name_of_several(names: Sequence[str], i: int) -> str:
-    """Return a name; empty for the only one, which needs none."""
-    if len(names) == 1:
-        return ""
-    return names[i]
+def name_among(name: str, names: Sized) -> str:
+    """Return a name; empty if it is the only one, which needs none."""
+    return name if len(names) > 1 else ""
 
 
 def about(subjects: Iterable[str], text: str) -> str:
-    """Return a text behind the names of its subjects, such as ``head: wrong``, but empty ones."""
+    """Return a text behind the names of its subjects, such as ``head: too low``, but empty ones."""
     return ": ".join([*filter(None, subjects), text])
 
 

@@ -36,7 +36,7 @@ from gpadjust.physics import (
 )
 from gpadjust.physics.formula import has_pi, names_in, parse, symbol
 from gpadjust.physics.function import array_physics
-from gpadjust.words import bare, labelled, listed, plural
+from gpadjust.words import bare, labelled, listed, noun_for, plural, shortened
 
 _HINT = (
     "Name columns as the file does; a unit in brackets may be left out, so that 'head' is 'head "
@@ -160,9 +160,8 @@ def read_table(
     has_output = ~matrix[:, d:].isnan().all(-1)
     rows = has_output.nonzero().flatten()
     if dropped := [str(line) for line in lines[~has_output].tolist()]:
-        shown = [*dropped[:10], *[f"{len(dropped) - 10} more"] * (len(dropped) > 10)]
-        lines_s = "line" + "s" * (len(dropped) > 1)
-        remarks.append(f"Left out, as they have no output: {lines_s} {listed(shown)}.")
+        first_lines = f"{noun_for(len(dropped), 'line')} {listed(shortened(dropped, 10))}"
+        remarks.append(f"Left out, as they have no output: {first_lines}.")
     if (n := len(rows)) > arguments.rows:
         # Drawn at random, as the first rows may be of one place or time; in the order of the file.
         order = torch.randperm(n, generator=torch.Generator().manual_seed(arguments.seed))
@@ -248,9 +247,11 @@ class GivenPhysics(NamedTuple):
 def imports_of(code: str, modules: Sequence[str], *names: str) -> str:
     """Return lines that import what the code of a physics needs, and names of the library."""
     names = (*(name for name in _MADE if f"{name}(" in code), *names)
-    lines = ["from math import inf\n"] * bool(re.search(r"\binf\b", code))
-    lines += ["import torch", *(f"import {module}" for module in modules)]
-    lines += [f"from gpadjust import {', '.join(names)}"] * bool(names)
+    lines = ["import torch", *(f"import {module}" for module in modules)]
+    if re.search(r"\binf\b", code):
+        lines.insert(0, "from math import inf\n")
+    if names:
+        lines.append(f"from gpadjust import {', '.join(names)}")
     return "\n".join(lines)
 
 
@@ -359,7 +360,9 @@ def given_physics(
     for text in texts:
         short = text.rpartition(":")[2].rpartition(".")[2]
         if text in formulas:  # figures have room for a short name
-            short = "formula" + f" {formulas.index(text) + 1}" * (len(formulas) > 1)
+            short = "formula"
+            if len(formulas) > 1:
+                short += f" {formulas.index(text) + 1}"
         name = text if short in parts else short
         make = _formula if text in formulas else _function
         try:  # before the fit, which may take minutes
@@ -369,13 +372,19 @@ def given_physics(
             raise ValueError(f"--physics {text}: {error}") from error
     used = {name for physics in parts.values() for name in physics.unknowns}
     if absent := [name for name in unknowns if name not in used]:
-        way = " A function has its own: FunctionPhysics(f, unknowns=...)." * (not formulas)
-        raise ValueError(f"--unknown names {absent[0]!r}, which is in no formula.{way}")
+        error = f"--unknown names {absent[0]!r}, which is in no formula."
+        if not formulas:
+            error += " A function has its own: FunctionPhysics(f, unknowns=...)."
+        raise ValueError(error)
     modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
+    physics: Any = parts
+    program = f"{{{', '.join(f'{name!r}: {text}' for name, text in code.items())}}}"
     if len(parts) == 1:
-        return GivenPhysics(parts[name], code[name] * bool(modules), modules)
-    several = ", ".join(f"{name!r}: {text}" for name, text in code.items())
-    return GivenPhysics(parts, f"{{{several}}}" * bool(modules), modules)
+        (physics,) = parts.values()
+        (program,) = code.values()
+    if not modules:  # a model's file holds formulas
+        program = ""
+    return GivenPhysics(physics, program, modules)
 
 
 def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tuple[Physics, str]:
@@ -385,8 +394,10 @@ def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tup
         physics = FormulaPhysics(text, data.X.columns, unknowns=used)
     except ValueError as error:
         raise ValueError(f"{error} {_HOW}") from error
-    more = f", unknowns={used!r}" * bool(used)
-    return physics, f"FormulaPhysics({text!r}, {[*physics.columns]!r}{more})"
+    arguments = f"{text!r}, {[*physics.columns]!r}"
+    if used:
+        arguments += f", unknowns={used!r}"
+    return physics, f"FormulaPhysics({arguments})"
 
 
 def _function(path: str, data: TableData, _: object = None) -> tuple[Physics, str]:
@@ -395,9 +406,11 @@ def _function(path: str, data: TableData, _: object = None) -> tuple[Physics, st
     code = path.replace(":", ".")
     try:
         physics = array_physics(function, data.X.to_numpy())
-    except (TypeError, PhysicsError) as error:
-        row = f" The first row is line {data.lines[0]} of the file."
-        raise ValueError(f"{error}{row * isinstance(error, PhysicsError)}") from error
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    except PhysicsError as error:
+        row = f"The first row is line {data.lines[0]} of the file."
+        raise ValueError(f"{error} {row}") from error
     is_numpy = isinstance(physics, BlackBoxPhysics) and physics is not function
     return physics, f"BlackBoxPhysics({code})" if is_numpy else code
 
@@ -462,8 +475,9 @@ def imported(path: str) -> Any:
         return attrgetter(name)(import_module(module))
     except (Exception, SystemExit) as error:  # importing runs the user's code
         last = traceback.extract_tb(error.__traceback__)[-1]
-        is_ours = "importlib" in last.filename or last.filename == __file__
-        place = f" ({Path(last.filename).name}, line {last.lineno})" * (not is_ours)
+        place = f" ({Path(last.filename).name}, line {last.lineno})"
+        if "importlib" in last.filename or last.filename == __file__:  # not the user's code
+            place = ""
         near = meant(module, files)
         if module in files:
             near = meant(name, vars(sys.modules.get(module, object)))
@@ -481,12 +495,13 @@ def _check(physics: Physics, data: TableData) -> None:
     Y = _values(physics, data)
     again = _values(physics, data)  # a random physics cannot be judged
     if Y.shape[-1] != m:
-        hint = " Commas part the outputs of a formula: is one a decimal comma?"
-        raise ValueError(
+        error = (
             f"expected {plural(m, 'column')}, one for each of --outputs "
             f"{', '.join(data.Y.columns)}, found {Y.shape[-1]}."
-            f"{hint * isinstance(physics, FormulaPhysics)}"
         )
+        if isinstance(physics, FormulaPhysics):
+            error += " Commas part the outputs of a formula: is one a decimal comma?"
+        raise ValueError(error)
     is_same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
     exclude = "Correct the physics there, or exclude such inputs:"
     settle = "Take random numbers out of it, or let it set their seed itself:"

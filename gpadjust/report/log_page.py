@@ -60,12 +60,13 @@ def page(machine: Identification, title: str | None, origin: Origin) -> Page:
     times = map(number, (control_step, seconds))
     step, held_out = (f"{time} {units.get('time', '')}".strip() for time in times)
     steps = sum(len(record.times) - 1 for record in machine.smoothed.records)
-    # Steps that are fitted, and held out.
-    hidden = f", {listed(machine.hidden)} hidden" * bool(machine.hidden)
+    steps_held_out = len(measured) * round(seconds / control_step)
+    states = listed(spec.states)
+    if machine.hidden:
+        states += f", {listed(machine.hidden)} hidden"
     lead = (
-        f"{listed(spec.states)}{hidden}, under {listed(spec.actions)}: fitted to "
-        f"{plural(steps, 'step')} of {step}, "
-        f"{plural(len(measured) * round(seconds / control_step), 'step')} held out."
+        f"{states}, under {listed(spec.actions)}: fitted to {plural(steps, 'step')} of {step}, "
+        f"{plural(steps_held_out, 'step')} held out."
     )
     cards, rows = _judged(machine, units, held_out)
     head = ["by", "state", "error (root mean square)", "unit", "95 % intervals cover"]
@@ -75,11 +76,13 @@ def page(machine: Identification, title: str | None, origin: Origin) -> Page:
         caption = "Parameters by the fitted part of the log"
         parameters = [html.parameter_table(caption, machine.parameters), tag("p", _PARAMETERS)]
         parameters.append(_combinations(machine))
-    lack = [tag("p", f"{machine.lack} {_LACK}")] * (machine.lack is not None)
+    lack = [_residual(machine, units)]
+    if machine.lack is not None:
+        lack.insert(0, tag("p", f"{machine.lack} {_LACK}"))
     sections = {
         "Parameters of the physics": html.join(parameters),
         "Free run": html.join([*free_run, _runs(machine, units)]),
-        "What the equations lack": html.join([*lack, _residual(machine, units)]),
+        "What the equations lack": html.join(lack),
         "Noise": _noise(machine, units),
         "States": _states(machine, units),
         "Advice": html.bullets([*machine.advice, *origin.notes]),
