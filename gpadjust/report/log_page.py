@@ -45,6 +45,10 @@ _LACK = (
     "bars are their means in bins, with intervals of 95 %. Parameters are fitted together with "
     "such a term."
 )
+_IN_PYTHON = (
+    "The command has no option for a fit to free runs: add `by_free_runs=True` to identify in the "
+    "program below, in Python."
+)
 _HEIGHT = 2.6  # inches of a figure
 _WINDOWS = 3  # that are drawn
 _DIVERGING = 1e30  # an error in any unit, or more
@@ -79,13 +83,16 @@ def page(machine: Identification, title: str | None, origin: Origin) -> Page:
     lack = [_residual(machine, units)]
     if machine.lack is not None:
         lack.insert(0, tag("p", f"{machine.lack} {_LACK}"))
+    advice = [*machine.advice, *origin.notes]
+    if origin.program and any("by_free_runs" in sentence for sentence in advice):
+        advice.append(_IN_PYTHON)
     sections = {
         "Parameters of the physics": html.join(parameters),
         "Free run": html.join([*free_run, _runs(machine, units)]),
         "What the equations lack": html.join(lack),
         "Noise": _noise(machine, units),
         "States": _states(machine, units),
-        "Advice": html.bullets([*machine.advice, *origin.notes]),
+        "Advice": html.bullets(advice),
         "Continue in Python": html.code(origin.program),
     }
     lines = []
