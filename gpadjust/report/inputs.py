@@ -154,23 +154,11 @@ def read_table(
             values.append(numbers)
         else:
             values.append(table.numbers(column, may_miss=not is_input))
-    # Leave out rows without any output, and all but some of very many.
     matrix = torch.stack(values, -1)
-    lines = torch.tensor(table.lines)
-    has_output = ~matrix[:, d:].isnan().all(-1)
-    rows = has_output.nonzero().flatten()
-    if dropped := [str(line) for line in lines[~has_output].tolist()]:
-        first_lines = f"{noun_for(len(dropped), 'line')} {listed(shortened(dropped, 10))}"
-        remarks.append(f"Left out, as they have no output: {first_lines}.")
-    if (n := len(rows)) > arguments.rows:
-        # Drawn at random, as the first rows may be of one place or time; in the order of the file.
-        order = torch.randperm(n, generator=torch.Generator().manual_seed(arguments.seed))
-        rows = rows[order[: arguments.rows].sort().values]
-        remarks.append(
-            f"Of {plural(n, 'row')} {arguments.rows:,} were taken, drawn at random by --seed: a "
-            "comparison takes time with the cube of their number. --rows takes more or fewer."
-        )
+    rows, of_rows = _rows_taken(table, matrix[:, d:], arguments)
+    remarks += of_rows
     X, Y = matrix[rows].split([d, len(outputs)], -1)
+    # Each output has observations to be judged by.
     for name, count in zip(names[d:], (~Y.isnan()).sum(0).tolist(), strict=True):
         if count < 2:
             raise ValueError(
@@ -187,7 +175,28 @@ def read_table(
             numbered = listed(f"{k} is {level}" for k, level in enumerate(of_column))
             remarks.append(f"The physics reads {bare(name)} as a number: {numbered}.")
     X_and_Y = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
-    return TableData(*X_and_Y, lines[rows].tolist(), tuple(remarks), levels)
+    lines = [table.lines[row] for row in rows.tolist()]
+    return TableData(*X_and_Y, lines, tuple(remarks), levels)
+
+
+def _rows_taken(table: Table, Y: Tensor, arguments: Namespace) -> tuple[Tensor, list[str]]:
+    """Return the rows with an output, of very many some, and remarks on the others."""
+    remarks = []
+    has_output = ~Y.isnan().all(-1)
+    rows = has_output.nonzero().flatten()
+    dropped = [str(table.lines[row]) for row in (~has_output).nonzero().flatten().tolist()]
+    if dropped:
+        lines = f"{noun_for(len(dropped), 'line')} {listed(shortened(dropped, 10))}"
+        remarks.append(f"Left out, as they have no output: {lines}.")
+    if (n := len(rows)) > arguments.rows:
+        # Drawn at random, as the first rows may be of one place or time; in the order of the file.
+        order = torch.randperm(n, generator=torch.Generator().manual_seed(arguments.seed))
+        rows = rows[order[: arguments.rows].sort().values]
+        remarks.append(
+            f"Of {plural(n, 'row')} {arguments.rows:,} were taken, drawn at random by --seed: a "
+            "comparison takes time with the cube of their number. --rows takes more or fewer."
+        )
+    return rows, remarks
 
 
 def _are_names(table: Table, name: str) -> bool:
@@ -358,33 +367,41 @@ def given_physics(
     formulas = [text for text in texts if ":" not in text]
     parts, code = dict[str, Physics](), dict[str, str]()
     for text in texts:
-        short = text.rpartition(":")[2].rpartition(".")[2]
-        if text in formulas:  # figures have room for a short name
-            short = "formula"
-            if len(formulas) > 1:
-                short += f" {formulas.index(text) + 1}"
+        short = _short_name(text, formulas)
         name = text if short in parts else short
-        make = _formula if text in formulas else _function
         try:  # before the fit, which may take minutes
-            parts[name], code[name] = make(text, data, unknowns)
+            if text in formulas:
+                parts[name], code[name] = _formula(text, data, unknowns)
+            else:
+                parts[name], code[name] = _function(text, data)
             _check(parts[name], data)
         except ValueError as error:
             raise ValueError(f"--physics {text}: {error}") from error
     used = {name for physics in parts.values() for name in physics.unknowns}
     if absent := [name for name in unknowns if name not in used]:
-        error = f"--unknown names {absent[0]!r}, which is in no formula."
+        message = f"--unknown names {absent[0]!r}, which is in no formula."
         if not formulas:
-            error += " A function has its own: FunctionPhysics(f, unknowns=...)."
-        raise ValueError(error)
-    modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
+            message += " A function has its own: FunctionPhysics(f, unknowns=...)."
+        raise ValueError(message)
+    # A single physics is itself, several are a dictionary.
     physics: Any = parts
     program = f"{{{', '.join(f'{name!r}: {text}' for name, text in code.items())}}}"
     if len(parts) == 1:
         (physics,) = parts.values()
         (program,) = code.values()
+    modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
     if not modules:  # a model's file holds formulas
         program = ""
     return GivenPhysics(physics, program, modules)
+
+
+def _short_name(text: str, formulas: Sequence[str]) -> str:
+    """Return a name for which figures have room."""
+    if text not in formulas:
+        return text.rpartition(":")[2].rpartition(".")[2]
+    if len(formulas) == 1:
+        return "formula"
+    return f"formula {formulas.index(text) + 1}"
 
 
 def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tuple[Physics, str]:
@@ -400,7 +417,7 @@ def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tup
     return physics, f"FormulaPhysics({arguments})"
 
 
-def _function(path: str, data: TableData, _: object = None) -> tuple[Physics, str]:
+def _function(path: str, data: TableData) -> tuple[Physics, str]:
     """Return the physics that a path names, and its code."""
     function = imported(path)
     code = path.replace(":", ".")
@@ -435,7 +452,8 @@ def motion(
         except (ValueError, TypeError) as error:
             raise ValueError(f"--physics {path}: {error}") from error
         return GivenPhysics(physics, path.replace(":", "."), (path.partition(":")[0],))
-    sides, primes = dict[str, str](), set[str]()  # right sides by state; "'" and ""
+    # Read the right side of each state, and whether it is a derivative: a prime, or nothing.
+    sides, primes = dict[str, str](), set[str]()
     for text in texts:
         match = _EQUATION.fullmatch(text)
         trees = [] if match is None else parse(match[3])
@@ -452,7 +470,8 @@ def motion(
             f"Expected an equation for each of {', '.join(states)}, all of time derivatives or all "
             f"of next values, found equations for {', '.join(sides)}."
         )
-    formula = ", ".join(sides[name] for name in states)  # outputs have commas between them
+    # One formula has all states as its outputs, with commas between them.
+    formula = ", ".join(sides[name] for name in states)
     columns = [*states, *actions]
     check_names(unknowns, "--unknown", names_in(formula), "the names in equations")
     physics = FormulaPhysics(formula, columns, unknowns=unknowns)
@@ -495,13 +514,13 @@ def _check(physics: Physics, data: TableData) -> None:
     Y = _values(physics, data)
     again = _values(physics, data)  # a random physics cannot be judged
     if Y.shape[-1] != m:
-        error = (
+        message = (
             f"expected {plural(m, 'column')}, one for each of --outputs "
             f"{', '.join(data.Y.columns)}, found {Y.shape[-1]}."
         )
         if isinstance(physics, FormulaPhysics):
-            error += " Commas part the outputs of a formula: is one a decimal comma?"
-        raise ValueError(error)
+            message += " Commas part the outputs of a formula: is one a decimal comma?"
+        raise ValueError(message)
     is_same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
     exclude = "Correct the physics there, or exclude such inputs:"
     settle = "Take random numbers out of it, or let it set their seed itself:"

@@ -64,6 +64,7 @@ def page(machine: Identification, title: str | None, origin: Origin) -> Page:
     times = map(number, (control_step, seconds))
     step, held_out = (f"{time} {units.get('time', '')}".strip() for time in times)
     steps = sum(len(record.times) - 1 for record in machine.smoothed.records)
+    # Steps that are fitted, and held out.
     steps_held_out = len(measured) * round(seconds / control_step)
     states = listed(spec.states)
     if machine.hidden:

@@ -228,7 +228,7 @@ def headline(cards: list[Card], kind: str) -> str:
     for card in cards:
         numbers = "; ".join(f"{label}: {value}" for label, value in card.errors.items())
         answer = f" {card.answer}."
-        if len(cards) == 1:
+        if len(cards) == 1:  # with room for a reason
             answer = f"\n{card.answer}. {card.reasons[0]}"
         lines.append(f"{kind} of {card.name}, {numbers}.{answer}")
     return "\n".join(lines)
@@ -286,9 +286,8 @@ def recommendation(subject: Subject) -> Markup:
         (name,) = comparison.models
         return tag("p", f"Only {name} was fitted: {tables.described(name, subject.link)}.")
     name = comparison.chosen
-    if name != STACKED:
-        why = f", {tables.described(name, subject.link)}. It has nearly all the weight."
-        return tag("p", "Recommended: ", tag("strong", name), why)
-    mixture = tag("strong", "the mixture of all structures")
-    why = ", with the weights of the table. Its intervals contain the doubt between them."
-    return tag("p", "Recommended: ", mixture, why)
+    why = f", {tables.described(name, subject.link)}. It has nearly all the weight."
+    if name == STACKED:
+        name = "the mixture of all structures"
+        why = ", with the weights of the table. Its intervals contain the doubt between them."
+    return tag("p", "Recommended: ", tag("strong", name), why)

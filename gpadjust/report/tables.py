@@ -22,17 +22,7 @@ from gpadjust.report.markup import Markup, join, table, tag
 from gpadjust.report.subject import Origin, Subject
 from gpadjust.validation.comparison import STACKED, cells_of, spread_of
 from gpadjust.validation.verdict import ALONE
-from gpadjust.words import (
-    bare,
-    listed,
-    name_and_unit,
-    noted,
-    noun_for,
-    number,
-    percent,
-    plural,
-    with_unit,
-)
+from gpadjust.words import bare, listed, name_and_unit, noted, number, percent, plural, with_unit
 
 _STRUCTURES = {
     "zero mean": "no physics: a Gaussian process of the data alone",
@@ -145,7 +135,7 @@ def _worst(subject: Subject, j: int) -> Markup:
     name = subject.outputs[j]
     outliers = subject.outliers(j)
     distance = loo.residuals[:, j].abs().nan_to_num(nan=-1.0)  # a missing one is the last
-    if loo.is_outlier is not None:
+    if loo.is_outlier is not None:  # an outlier is farther than all others
         distance = distance.masked_fill(loo.is_outlier[:, j], math.inf)
     order = [i for i in distance.argsort(descending=True).tolist() if distance[i] >= 0][:_WORST]
     has_room = len(subject.inputs) <= 4
@@ -298,8 +288,7 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     arguments = [repr(file)]
     # The file may hold the physics, or its name, or neither.
     if origin.physics:
-        where = f"{noun_for(len(origin.modules), 'module')} {listed(origin.modules)}"
-        words.append(f"Python has to find the {where}: there, or in a folder on PYTHONPATH.")
+        words.append(f"Python imports {listed(origin.modules)} from there, or from PYTHONPATH.")
         arguments.append(f"physics={origin.physics}")
         missing = [name for name in missing if name != "physics"]
     elif "physics" in missing:
