@@ -107,8 +107,8 @@ def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
 @drawn
 def agreement(subject: Subject, output: int) -> list[Markup]:
     """Return observations over left-out predictions, by the formula and corrected."""
-    formulas = subject.physics_at(subject.X, output)
-    first = dict(zip(["your formula"], formulas.values(), strict=False))  # one or none
+    formulas = [*subject.physics_at(subject.X, output).values()]
+    first = {"your formula": formulas[0]} if formulas else {}
     figure = html.new_figure(3.2)
     y = subject.loo.judged[:, output]
     legend(plots.draw_left_out(figure.subplots(), subject.loo, y, output, first))

@@ -335,7 +335,7 @@ def columns_of(
     absent = sorted(used - {*symbols, *unknowns})
     if not absent and (columns or inputs):
         return columns
-    wrong = (absent or ["none of them"])[0]
+    wrong = absent[0] if absent else "none of them"
     hint = meant(wrong, [*symbols, *unknowns])
     if _CELL.fullmatch(wrong):
         hint = f" {wrong} seems to be a cell: write the name of its column."
@@ -643,4 +643,4 @@ def variances_of(
 def meant(name: str, others: Iterable[str]) -> str:
     """Return a hint at the name that was meant, if some is near."""
     near = get_close_matches(name, [*others], n=1)
-    return "".join(f" Is it {match!r}?" for match in near)
+    return f" Is it {near[0]!r}?" if near else ""

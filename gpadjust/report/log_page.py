@@ -49,6 +49,7 @@ _IN_PYTHON = (
     "The command has no option for a fit to free runs: add `by_free_runs=True` to identify in the "
     "program below, in Python."
 )
+_COLORS = {"Yes": "yes", "No": "no"}  # other answers are open
 _HEIGHT = 2.6  # inches of a figure
 _WINDOWS = 3  # that are drawn
 _DIVERGING = 1e30  # an error in any unit, or more
@@ -121,7 +122,7 @@ def _judged(
         rmse = {by: float(machine.errors[by][i]) for by in _NAMES if by in machine.errors}
         answer, reasons = machine.verdicts[name]
         errors = {_NAMES[by]: _error(error, unit) for by, error in rmse.items()}
-        color = {"Yes": "yes", "No": "no"}.get(answer, "open")
+        color = _COLORS.get(answer, "open")
         cards.append(Card(name, errors, note, answer, reasons, color))
         shares = {IDENTIFIED: percent(machine.coverage[i])}
         for by, error in rmse.items():

@@ -319,8 +319,7 @@ def _plot_curve(ax: Axes, curve: Curve, unknown: Unknown) -> None:
     x = torch.linspace(low, high, _POINTS).double()
     draws = curve(x)
     ends = draws.quantile(draws.new_tensor([0.025, 0.975]), dim=0)
-    ax.fill_between(x, *ends, color=BLUE, alpha=0.25, lw=0, label="95 %")
-    ax.plot(x, draws.mean(0), color=BLUE, label="mean")
+    band(ax, x, [draws.mean(0), *ends], 0.95)
     half = quantile(0.95)
     for end in unknown.value(torch.tensor([-half, half]).double()).tolist():
         ax.axhline(end, color=GREY, ls=":", lw=1.0)
