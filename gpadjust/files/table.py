@@ -15,7 +15,7 @@ from torch import Tensor
 from gpadjust.files import fields as read
 from gpadjust.files.rows import is_value, numeric_columns, rows_of_sheet, rows_of_text
 from gpadjust.physics.formula import symbol
-from gpadjust.words import labelled, plural
+from gpadjust.words import plural
 
 LARGEST = 1e100
 """The largest number that is accepted; squares of larger ones may overflow."""
@@ -227,7 +227,7 @@ class Table:
     @property
     def _labels(self) -> list[str]:
         pairs = zip(self.names, self.units, strict=True)
-        return [labelled(name, unit) for name, unit in pairs]
+        return [f"{name} [{unit}]" if unit else name for name, unit in pairs]
 
     def _column(self, name: str) -> int:
         """Return the place of a column: by its header, its name without the unit, or its symbol."""
