@@ -166,20 +166,15 @@ def verdict_of(c: Any, j: int, f: Tensor | None, fault: Fault | None) -> Verdict
     )
     correction = ""
     if f is not None:  # of several physics there is no error of the formula
-        loo = c.left_out[best.structure]
-        y = loo.judged[:, j]
+        y = c.left_out[best.structure].judged[:, j]
         is_judged = ~y.isnan()
         factor, offset, line = straight_line(y[is_judged], f[is_judged])
-        evidence = evidence._replace(
-            alone=float((y - f)[is_judged].square().mean().sqrt()),
-            line=line,
-            factor=factor,
-            offset=offset,
-        )
-        formula = [densities[name] for name in (ALONE, CALIBRATED) if name in densities]
-        if formula:
-            shown = is_shown(densities[adjusted.structure], formula[0])
-            evidence = evidence._replace(is_surpassed=shown)
+        alone = rms((y - f)[is_judged])
+        evidence = evidence._replace(alone=alone, line=line, factor=factor, offset=offset)
+        formula = densities.get(ALONE, densities.get(CALIBRATED))
+        if formula is not None:
+            corrected = difference(densities[adjusted.structure], formula)
+            evidence = evidence._replace(is_surpassed=is_clear(*corrected))
         # That of the recommended model, if it is one that adjusts the formula.
         names = {row.structure for row in rows if row.kind == ADJUSTED}
         correction = correction_of(c.models[c.chosen] if c.chosen in names else model, j, f)
@@ -292,11 +287,6 @@ def _corrected(e: Evidence, correction: str) -> Verdict:
 def is_clear(gain: float, se: float) -> bool:
     """Return whether a gain is more than a nat and than two standard errors."""
     return gain > max(_SURE * se, _LEAST)
-
-
-def is_shown(first: Tensor, second: Tensor) -> bool:
-    """Return whether densities of the first are better by a nat and by two standard errors."""
-    return is_clear(*difference(first, second))
 
 
 def straight_line(y: Tensor, f: Tensor) -> tuple[float, float, float]:
