@@ -152,8 +152,9 @@ def _is_standardised(values: Tensor) -> bool:
 
 
 def is_constant(values: Tensor) -> bool:
-    """Return whether values are equal but for rounding."""
-    return float(values.std()) <= _ROUNDING * rms(values)
+    """Return whether values are equal but for rounding, as a single one is."""
+    varies = float(values.std()) > _ROUNDING * rms(values)  # NaN of a single one is not
+    return not varies
 
 
 def rms(values: Tensor) -> float:
