@@ -12,7 +12,6 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from datetime import date, time, timedelta
 from numbers import Real
 from operator import index
 from pathlib import Path
@@ -22,10 +21,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-
-# Types that NumPy would turn into numbers.
-_DATES = (date, time, timedelta, np.datetime64, np.timedelta64)
-_NO_NUMBERS: tuple[type, ...] = (str, bytes, complex, np.complexfloating, *_DATES)
 
 
 def checked_whole(name: str, value: Any, least: int | None = None) -> int:
@@ -141,47 +136,6 @@ def finite_array(values: Any, shape: tuple[int, ...]) -> NDArray[np.float64] | N
     except (TypeError, ValueError):
         return None
     return numbers if numbers.shape == shape and np.isfinite(numbers).all() else None
-
-
-def as_tensor(values: Any, name: str) -> Tensor:
-    """Return a float64 tensor as it is, or one of an array, frame or Series, which is a column."""
-    if isinstance(values, Tensor):
-        if values.is_complex():
-            raise _no_numbers(name, [str(values.dtype)])
-        if values.dtype != torch.float64:  # Cholesky factors of these kernels fail in float32
-            raise TypeError(
-                f"Expected {name} in float64; found {values.dtype}; take `{name}.double()`."
-            )
-        return values
-    if hasattr(values, "to_frame"):  # a Series is a column
-        values = values.to_frame()
-    array = getattr(values, "to_numpy", lambda: values)()
-    if not isinstance(array, np.ndarray):
-        kind = type(values).__name__
-        raise TypeError(f"Expected {name} as a tensor, an array or a frame; found {kind}.")
-    if np.ma.is_masked(array):
-        raise ValueError(
-            f"Expected {name} unmasked; take `{name}.filled(np.nan)`, or leave out rows."
-        )
-    types = {array.dtype.type}
-    if array.dtype.kind == "O":
-        types = {type(value) for value in array.flat}
-    wrong = [kind.__name__ for kind in types if issubclass(kind, _NO_NUMBERS)]
-    if wrong:
-        raise _no_numbers(name, wrong)
-    try:
-        return torch.as_tensor(np.array(array, dtype=np.float64))
-    except (TypeError, ValueError) as error:
-        raise _no_numbers(name, [str(error)]) from error
-
-
-def _no_numbers(name: str, types: Sequence[str]) -> TypeError:
-    return TypeError(
-        f"Expected {name} to contain numbers only; found {', '.join(types)}. Convert numbers in "
-        "text with `.astype(float)`, dates to seconds with `(t - t.min()) / np.timedelta64(1, "
-        "'s')`; take the real part of complex numbers. Columns of text in a frame of inputs may be "
-        "categories, input_transform=Categories() of gpadjust.kinds; drop other text."
-    )
 
 
 def checked_tensor(name: str, values: Any) -> Tensor:

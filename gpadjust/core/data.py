@@ -5,18 +5,24 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from copy import deepcopy
+from datetime import date, time, timedelta
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
-from gpadjust.checks import as_tensor, check_finite, check_observed, check_transform, marked_rows
+from gpadjust.checks import check_finite, check_observed, check_transform, marked_rows
 
 ArrayLike = Any
 """A float64 tensor, or a NumPy array, DataFrame or Series (pandas or polars) of numbers."""
 
 _FAINT = 1e-6  # of the size of the targets: their unit where the prior mean meets them
+
+# Types that NumPy would turn into numbers.
+_DATES = (date, time, timedelta, np.datetime64, np.timedelta64)
+_NO_NUMBERS: tuple[type, ...] = (str, bytes, complex, np.complexfloating, *_DATES)
 
 
 class Data(NamedTuple):
@@ -124,6 +130,47 @@ def unit_of(Y: Tensor, mean: Tensor) -> Tensor:
     unit = torch.where(spread > 1e-12 * size, away.minimum(spread), away)
     tiny = _FAINT * size.where(size > 0, torch.full_like(size, 1 / _FAINT))
     return unit.where(unit > 1e-13 * size, tiny).mT
+
+
+def as_tensor(values: ArrayLike, name: str) -> Tensor:
+    """Return a float64 tensor as it is, or one of an array, frame or Series, which is a column."""
+    if isinstance(values, Tensor):
+        if values.is_complex():
+            raise _no_numbers(name, [str(values.dtype)])
+        if values.dtype != torch.float64:  # Cholesky factors of these kernels fail in float32
+            raise TypeError(
+                f"Expected {name} in float64; found {values.dtype}; take `{name}.double()`."
+            )
+        return values
+    if hasattr(values, "to_frame"):  # a Series is a column
+        values = values.to_frame()
+    array = getattr(values, "to_numpy", lambda: values)()
+    if not isinstance(array, np.ndarray):
+        kind = type(values).__name__
+        raise TypeError(f"Expected {name} as a tensor, an array or a frame; found {kind}.")
+    if np.ma.is_masked(array):
+        raise ValueError(
+            f"Expected {name} unmasked; take `{name}.filled(np.nan)`, or leave out rows."
+        )
+    types = {array.dtype.type}
+    if array.dtype.kind == "O":
+        types = {type(value) for value in array.flat}
+    wrong = [kind.__name__ for kind in types if issubclass(kind, _NO_NUMBERS)]
+    if wrong:
+        raise _no_numbers(name, wrong)
+    try:
+        return torch.as_tensor(np.array(array, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise _no_numbers(name, [str(error)]) from error
+
+
+def _no_numbers(name: str, types: Sequence[str]) -> TypeError:
+    return TypeError(
+        f"Expected {name} to contain numbers only; found {', '.join(types)}. Convert numbers in "
+        "text with `.astype(float)`, dates to seconds with `(t - t.min()) / np.timedelta64(1, "
+        "'s')`; take the real part of complex numbers. Columns of text in a frame of inputs may be "
+        "categories, input_transform=Categories() of gpadjust.kinds; drop other text."
+    )
 
 
 def variances_of(values: ArrayLike, Y: Tensor, name: str = "train_Yvar") -> Tensor:

@@ -22,8 +22,7 @@ from gpytorch.priors import NormalPrior
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
-from gpadjust.checks import as_tensor
-from gpadjust.core.data import ArrayLike, Data, appended, as_given, unit_of
+from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
 from gpadjust.core.gaussian import (
     Conditioning,

@@ -275,9 +275,12 @@ def named_physics(physics: Any, spec: StateSpec) -> dict[str, Physics]:
         named = {str(i + 1): function for i, function in enumerate(several)}
     parts: dict[str, Physics] = {}
     for name, function in named.items():
-        part = parts[name] = as_physics(function)
-        if isinstance(physics, Mapping) and part is not function:  # not the user's object
-            part.name = name
+        part = function
+        if not isinstance(function, Physics):
+            part = as_physics(function)
+            if isinstance(physics, Mapping):
+                part.name = name
+        parts[name] = part
         if isinstance(part, ODEPhysics) and part.difference:
             raise ValueError(
                 f"Physics {part.name!r} returns the change of the state (difference=True), but "

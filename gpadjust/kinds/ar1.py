@@ -8,9 +8,9 @@ import torch
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
-from gpadjust.checks import as_tensor, checked_bounds, checked_whole
+from gpadjust.checks import checked_bounds, checked_whole
 from gpadjust.core import GP, KnownNoise, Noise, Row, Term
-from gpadjust.core.data import ArrayLike, Data, appended, names_of, unit_of
+from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, names_of, unit_of
 from gpadjust.core.gaussian import Marginals
 from gpadjust.core.kernels import Features, Kernel, PullBack, as_kernel
 from gpadjust.core.structures import DELTA_CONSTANT

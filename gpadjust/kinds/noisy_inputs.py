@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gpadjust.checks import as_tensor
 from gpadjust.core import Noise
-from gpadjust.core.data import ArrayLike, as_given, names_of, variances_of
+from gpadjust.core.data import ArrayLike, as_given, as_tensor, names_of, variances_of
 from gpadjust.kinds.heavy_tails import RowNoise
 from gpadjust.physics import PhysicsError
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gpadjust.checks import as_tensor, checked_whole
-from gpadjust.core.data import ArrayLike
+from gpadjust.checks import checked_whole
+from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.core.model import GP
 from gpadjust.kinds.updates import design
 

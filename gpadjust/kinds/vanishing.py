@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.checks import as_tensor, check_finite
-from gpadjust.core.data import Data, columns_of
+from gpadjust.checks import check_finite
+from gpadjust.core.data import Data, as_tensor, columns_of
 from gpadjust.core.kernels import Features, Kernel, as_kernel
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import LogNormal, Row, Values

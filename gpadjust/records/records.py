@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import as_tensor, check_choice, check_finite, check_kind, checked_number
-from gpadjust.core.data import ArrayLike
+from gpadjust.checks import check_choice, check_finite, check_kind, checked_number
+from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.files.fields import is_moment, seconds_of
 from gpadjust.files.table import Table

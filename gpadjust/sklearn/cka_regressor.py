@@ -16,9 +16,9 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from torch import Size, Tensor
 
 from gpadjust import core
-from gpadjust.checks import as_tensor, checked_whole, seeded
+from gpadjust.checks import checked_whole, seeded
 from gpadjust.core import CKA, FitResult, ZeroMeanGP, fit
-from gpadjust.core.data import column_names
+from gpadjust.core.data import as_tensor, column_names
 from gpadjust.core.model import Predictive
 from gpadjust.kinds.categories import Categories
 from gpadjust.kinds.factory import ModelFactory, make_model, map_parts, with_options
