@@ -32,11 +32,10 @@ from gpadjust.core.gaussian import (
     add_noise,
     sum_likelihood,
 )
-from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.summary import counted, summary, summary_html
-from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
+from gpadjust.core.terms import Places, Term, TermSum, WeightedSum, with_kernel
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import MeanView, NoiseView, OtherPriors, TermView, squeezed
 from gpadjust.display import Display
@@ -201,7 +200,7 @@ class GP(gpytorch.models.GP, Predictive):
         self.physics = [as_physics(function) for function in physics]
         for f_p in self.physics:
             f_p.check_names(self.data.input_names)
-        terms = [_with_kernel(term) for term in terms]
+        terms = [with_kernel(term) for term in terms]
         if type(self) is GP:
             settings = {"terms": terms, "noise": noise, "choices": choices}
             settings["input_transform"] = input_transform
@@ -520,7 +519,9 @@ class GP(gpytorch.models.GP, Predictive):
         X = self.data.X
         names = [*self._unknowns]
         z = torch.cat([values[f"physics.{name}"] for name in names], -1)  # S x p
-        p = len(names) * with_slopes
+        p = 0
+        if with_slopes:
+            p = len(names)
         steps = _STEP * torch.eye(p, len(names)).to(z).unsqueeze(1)
         # Central differences, by one call: (1 + 2 p) x S x p.
         shifted = torch.cat([z.unsqueeze(0), z + steps, z - steps])
@@ -913,18 +914,6 @@ def _unknown_option(structure: type[GP], name: str) -> TypeError:
         f"{', '.join(sorted(names | {'noise', 'input_transform'}))}. Kinds of data are noises and "
         "input transforms of gpadjust.kinds; see CHANGELOG.md for earlier names."
     )
-
-
-def _with_kernel(term: Any) -> Term:
-    """Return a term of a kernel of this library or of GPyTorch."""
-    if not isinstance(term, Term):
-        raise TypeError(f"Expected terms as a list of Term(name, kernel, ...); found {term!r}.")
-    if term.kernel is None:
-        return term
-    kernel = as_kernel(term.kernel, DELTA if term.physics is None else RHO)
-    if not kernel.has_constant:
-        term = term._replace(constant=None)
-    return term._replace(kernel=kernel)
 
 
 def _coordinates(model: GP) -> Tensor:

@@ -74,7 +74,10 @@ class MixturePosterior(GPyTorchPosterior):
         """``... x q m``, and of several components one more, which picks the component."""
         mean, _ = self.gaussians
         S, m, q = mean.shape[-3:]
-        return Size([*mean.shape[:-3], q * m + (S > 1)])
+        size = q * m
+        if S > 1:
+            size += 1
+        return Size([*mean.shape[:-3], size])
 
     @property
     def marginals(self) -> Marginals:

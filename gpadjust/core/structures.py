@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gpadjust.core.data import ArrayLike, names_of
-from gpadjust.core.kernels import DELTA, RHO, Fourier, as_kernel
+from gpadjust.core.fourier import Fourier
+from gpadjust.core.kernels import DELTA, RHO
 from gpadjust.core.model import GP
-from gpadjust.core.terms import Term
+from gpadjust.core.terms import Term, as_kernel
 from gpadjust.core.unknowns import Choice, LogNormal
 
 RHO_CONSTANT = LogNormal(0.01, 100.0)  # prior variance of a constant in rho, or of rho alone
@@ -68,7 +69,7 @@ class CKA(GP):
         settings = options | {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
-            "constants": _plain(constants), "nested": nested, "extra_terms": [*extra_terms],
+            "constants": constants, "nested": nested, "extra_terms": [*extra_terms],
         }  # fmt: skip
         rhos, functions = _scalings(physics, rho_mean)
         kernel = as_kernel(rho_covar_module, RHO)
@@ -129,7 +130,7 @@ class PhysicsMeanGP(GP):
         physics: Any, covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True,
         **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
+        settings = options | {"covar_module": covar_module, "constants": constants}
         rhos, functions = _scalings(physics)
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[*rhos, _delta(covar_module, constants)],
@@ -149,7 +150,7 @@ class ScaleGP(GP):
         physics: Any, covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True,
         **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
+        settings = options | {"covar_module": covar_module, "constants": constants}
         constant = _constant(constants, "rho", RHO_CONSTANT)
         rho = Term("rho", as_kernel(covar_module, RHO_CONSTANT), 1.0, constant, 0)
         super().__init__(
@@ -168,7 +169,7 @@ class ZeroMeanGP(GP):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True, **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
+        settings = options | {"covar_module": covar_module, "constants": constants}
         f = _delta(covar_module, constants, "f")
         super().__init__(train_X, train_Y, train_Yvar, terms=[f], settings=settings, **options)
 
@@ -222,13 +223,6 @@ def _constant(
     if isinstance(constants, Mapping):
         return LogNormal(*constants.get(name, prior))
     return prior if constants else None
-
-
-def _plain(constants: bool | Mapping[str, LogNormal]) -> Any:
-    """Return constants as values of a file."""
-    if isinstance(constants, Mapping):
-        return {name: tuple(prior) for name, prior in constants.items()}
-    return constants
 
 
 def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "delta") -> Term:

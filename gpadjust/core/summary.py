@@ -65,7 +65,8 @@ def counted(model: Any) -> str:
     """Return the sizes of a model, such as "8 points, 1 input, 1 output, 16 draws"."""
     n, d = model.data.X.shape[-2:]
     counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
-    return ", ".join(f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items())
+    nouns = [noun if count == 1 else f"{noun}s" for noun, count in counts.items()]
+    return ", ".join(f"{count} {noun}" for noun, count in zip(nouns, counts.values(), strict=True))
 
 
 def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:
@@ -157,9 +158,11 @@ def _labels(model: Any, term: Term, name: str, number: int) -> list[str]:
     is_length = name.endswith("lengthscale")
     if is_length and number == len(names):
         return [f" of {name}{after}" for name in names]
+    if not is_length:
+        after = ""
     if number == 1:
-        return [after * is_length]
-    return [f" {i + 1}{after * is_length}" for i in range(number)]
+        return [after]
+    return [f" {i + 1}{after}" for i in range(number)]
 
 
 def _of_noise(model: Any, sd: Tensor, j: int) -> list[str]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.core.kernels import Features, Kernel, PullBack
+from gpadjust.core.gpytorch_kernels import OfGPyTorch
+from gpadjust.core.kernels import DELTA, RBF, RHO, Features, Kernel, PullBack, Stationary
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
 
@@ -39,6 +40,27 @@ class Term(NamedTuple):
     def varies(self) -> bool:
         """Whether g differs from its mean."""
         return self.kernel is not None or self.constant is not None
+
+
+def as_kernel(kernel: Any, outputscale: LogNormal = DELTA) -> Kernel:
+    """Return a kernel of this library, one of GPyTorch in a wrapper, or the default RBF."""
+    if kernel is None:
+        return Stationary(RBF, outputscale)
+    if isinstance(kernel, Kernel):
+        return kernel.of_term(outputscale)
+    return OfGPyTorch(kernel, outputscale)
+
+
+def with_kernel(term: Any) -> Term:
+    """Return a term with a kernel of this library, also where it has one of GPyTorch."""
+    if not isinstance(term, Term):
+        raise TypeError(f"Expected terms as a list of Term(name, kernel, ...); found {term!r}.")
+    if term.kernel is None:
+        return term
+    kernel = as_kernel(term.kernel, DELTA if term.physics is None else RHO)
+    if not kernel.has_constant:
+        term = term._replace(constant=None)
+    return term._replace(kernel=kernel)
 
 
 class Places(NamedTuple):

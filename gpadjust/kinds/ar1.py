@@ -12,9 +12,9 @@ from gpadjust.checks import checked_bounds, checked_whole
 from gpadjust.core import GP, KnownNoise, Noise, Row, Term
 from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, names_of, unit_of
 from gpadjust.core.gaussian import Marginals
-from gpadjust.core.kernels import Features, Kernel, PullBack, as_kernel
+from gpadjust.core.kernels import Features, Kernel, PullBack
 from gpadjust.core.structures import DELTA_CONSTANT
-from gpadjust.core.terms import Places
+from gpadjust.core.terms import Places, as_kernel
 from gpadjust.core.unknowns import Values
 from gpadjust.physics import as_physics
 

@@ -15,7 +15,8 @@ from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
 from gpadjust.core.data import ArrayLike, Data, columns_of, names_of
-from gpadjust.core.kernels import DELTA, Features, Fourier, Kernel, PullBack, Stationary
+from gpadjust.core.fourier import Fourier
+from gpadjust.core.kernels import DELTA, Features, Kernel, PullBack, Stationary
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Row, Values
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gpadjust.checks import check_finite
 from gpadjust.core.data import Data, as_tensor, columns_of
-from gpadjust.core.kernels import Features, Kernel, as_kernel
-from gpadjust.core.terms import Term
+from gpadjust.core.kernels import Features, Kernel
+from gpadjust.core.terms import Term, as_kernel
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
 _ROUNDING = 1e-10  # of the variance, added at several places, which may be close to each other
