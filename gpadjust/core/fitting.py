@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.core.noise import Noise
 from gpadjust.core.nuts import CHAINS, nuts
 from gpadjust.core.sample import GROUPS, Draws, Normal, around_mode, maximise, sample
@@ -127,7 +128,7 @@ def fit(
     Raises:
         ValueError: If the method or number of draws is unknown, or the data are a batch; of NUTS
             also if there are nested models or no density.
-        TypeError: If it is not a model of this library.
+        TypeError: If it is not a model of this library, or num_draws is not a whole number.
         ImportError: Of NUTS, if Pyro is not installed.
 
     Example:
@@ -138,7 +139,10 @@ def fit(
         True
     """
     if not hasattr(model, "log_likelihood"):
-        raise TypeError(f"Expected a model of gpadjust.core; found {type(model).__name__}.")
+        raise TypeError(
+            f"Expected a model of gpadjust.core; found {type(model).__name__}. Of a list fit each "
+            "model: for part in model.models: fit(part)."
+        )
     if method not in _METHODS:
         raise ValueError(f"Unknown method {method!r}; expected 'bayes', 'map' or 'nuts'.")
     if method == "nuts" and not model.has_density:
@@ -147,10 +151,11 @@ def fit(
     if method == "nuts" and model.table.choices:
         raise ValueError("NUTS does not draw from nested models; build it with nested=False.")
     least = 4 * CHAINS if method == "nuts" else 4  # R-hat needs four draws a chain
-    if num_draws is not None and (num_draws < least or num_draws % 4):
-        raise ValueError(
-            f"Expected num_draws as a multiple of 4, from {least} on; found {num_draws}."
-        )
+    if num_draws is not None:
+        num_draws = checked_whole("num_draws", num_draws)
+        if num_draws < least or num_draws % 4:
+            expected = f"a multiple of 4, from {least} on"
+            raise ValueError(f"Expected num_draws as {expected}; found {num_draws}.")
     if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")

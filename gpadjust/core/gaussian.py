@@ -210,7 +210,7 @@ class Conditioning:
         """Return means without k, which takes half the time."""
         return sought.mean + sought.cross_times(self.train, self.alpha * self.observed)
 
-    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+    def moments(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and variances at each point, ``... x S x m x q``."""
         mean, cross = self.mean(sought)
         white = self.white(cross)

@@ -20,6 +20,7 @@ Features = Callable[[Tensor], Tensor]
 RHO = LogNormal(0.001, 100.0)  # prior variance of a scaling's process
 DELTA = LogNormal(0.1, 1000.0)  # that of a process in squared units of the targets
 LENGTH_FACTOR = 7.4
+STANDARD_DEVIATION = "standard deviation"  # of a process, in summaries
 
 
 class Kernel(ABC):
@@ -51,6 +52,15 @@ class Kernel(ABC):
     def of_term(self, outputscale: LogNormal) -> Kernel:
         """Return the kernel with the prior variance of a term if it has none; or itself."""
         return self
+
+    def in_user_units(self, name: str, numbers: Tensor, unit: float) -> tuple[str, Tensor]:
+        """Return the name and numbers of a parameter in summaries, by the unit of the process.
+
+        Here an ``outputscale``, a variance, becomes a standard deviation; others have no unit.
+        """
+        if not name.endswith("outputscale"):
+            return name, numbers
+        return name.replace("outputscale", STANDARD_DEVIATION), numbers.sqrt() * unit
 
     def variance(self, own: Values, x: Tensor) -> Tensor:
         """Return the prior variances, ``... x S x m x n`` (or 1 where all are equal)."""

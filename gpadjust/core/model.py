@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from inspect import signature
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import gpytorch
 import torch
@@ -94,6 +94,22 @@ class Predictive(Model, FantasizeMixin, Display):
     def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
         """Return the distributions of Gaussian components ``... x S x q x m``."""
         return Marginals(means, variances)
+
+    def to(self, *args: Any, **options: Any) -> Self:
+        """Move the model to a device, with its data; a TypeError for a type but float64."""
+        kinds = {getattr(value, "dtype", value) for value in (*args, *options.values())}
+        wrong = [kind for kind in kinds - {torch.float64} if isinstance(kind, torch.dtype)]
+        if wrong:
+            raise TypeError(f"Expected a device, as models compute in float64; found {wrong[0]}.")
+        return super().to(*args, **options)
+
+    def float(self) -> Self:
+        """Raise a TypeError, as :meth:`to` does."""
+        return self.to(torch.float32)
+
+    def half(self) -> Self:
+        """Raise a TypeError, as :meth:`to` does."""
+        return self.to(torch.float16)
 
     def posterior_of(self, mixture: MixturePosterior, outputs: list[int] | slice) -> Any:
         """Return the posterior of some outputs of a mixture where the model is Gaussian."""
@@ -229,7 +245,7 @@ class GP(gpytorch.models.GP, Predictive):
         if self.data.Yvar is not None:
             known_noise = KnownNoise(self.noise_in_units(Y, self.data.Yvar))
             noise = known_noise if noise is None else noise.with_known(known_noise)
-        self.noise = (noise or Noise()).of_terms(self.term_sum)
+        self.noise = (noise or Noise()).of_data(self.data, self.term_sum)
         # The table of all unknown numbers, and u.
         rows = self.term_sum.rows(self.data.kernel_inputs(X), m) + self.noise.rows(Y)
         rows += [Row(f"physics.{n}", Y.new_zeros(1), is_shared=True) for n in self._unknowns]
@@ -598,7 +614,7 @@ class GP(gpytorch.models.GP, Predictive):
         with self._graph_for(X):
             values = conditioning.train.values
             f = self.term_sum.evaluate(values, self.places(X, values))
-            mean, variance = conditioning.marginals(f)
+            mean, variance = conditioning.moments(f)
             if observation_noise is not False:
                 variance = variance + self._noise_at(X, observation_noise)
             variance = variance * self.unit.square()
@@ -737,6 +753,11 @@ class GP(gpytorch.models.GP, Predictive):
             conditioning = new.conditioned(*new._observed(values), old)
         new._cached = (self.u.detach().clone(), conditioning)
         return new.eval()
+
+    def set_train_data(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise an error: the data of a model stay."""
+        way_out = "model.condition_on_observations(X, Y) returns one with further rows"
+        raise NotImplementedError(f"The data of a model stay; build another one, or {way_out}.")
 
     def get_fantasy_model(self, inputs: Any, targets: Tensor, **options: Any) -> Self:
         """Condition on targets ``... x (m) x k``, as GPyTorch's lists of models do."""

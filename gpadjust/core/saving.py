@@ -77,7 +77,7 @@ def save(model: GP | StackedGP, path: str | Path) -> Saved:
     if not isinstance(model, GP | StackedGP):
         raise TypeError(
             f"Expected a model of gpadjust.core; found {type(model).__name__}. Of a comparison "
-            "save comparison.recommended."
+            "save comparison.recommended, of a list each of model.models."
         )
     path = Path(path)
     if path.is_dir() or not path.parent.is_dir():

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gpadjust.core.kernels import STANDARD_DEVIATION as _SD
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Values
 from gpadjust.display import html_table
 
-_SD = "standard deviation"
 _MEANINGS = {
     "lengthscale": "distance over which {} changes",
     _SD: "size of the changes of {}",
@@ -102,11 +102,11 @@ def numbers_of_term(model: Any, term: Term, values: Values, j: int) -> list[Numb
     """Return the numbers of a term of an output, at values ``N x m x k``."""
     unit = float(model.unit[j]) if term.physics is None else 1.0  # a scaling has no unit
     numbers = []
+    kernel: Any = term.kernel
     start = f"{term.name}.kernel."
     for key in (key for key in values if key.startswith(start)):
-        draws, name = values[key][:, j], key.removeprefix(start).replace("raw_", "")
-        if name.endswith("outputscale"):
-            draws, name = draws.sqrt() * unit, name.replace("outputscale", _SD)
+        name = key.removeprefix(start).replace("raw_", "")
+        name, draws = kernel.in_user_units(name, values[key][:, j], unit)
         meaning = _MEANINGS.get(name, f"a number of the kernel of {term.name}").format(term.name)
         labels = _labels(model, term, name, draws.shape[-1])
         for label, column in zip(labels, draws.unbind(-1), strict=True):

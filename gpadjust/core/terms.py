@@ -66,9 +66,9 @@ def with_kernel(term: Any) -> Term:
 class Places(NamedTuple):
     """Points at which a sum is evaluated."""
 
-    x: Tensor  # inputs of kernels, ... x 1 x 1 x n x d
+    kernel_inputs: Tensor  # X after the input transform, ... x 1 x 1 x n x d
     f: Sequence[Tensor]  # the outputs of each physics, ... x S x m x n (1 for S)
-    X: Tensor  # the inputs in the user's units, ... x 1 x 1 x n x d
+    X: Tensor  # the inputs as the user gave them, ... x 1 x 1 x n x d
 
 
 @dataclass
@@ -293,7 +293,7 @@ class TermSum:
 
     def mean(self, values: Values, places: Places) -> Tensor:
         """Return the prior mean of the sum, ``... x S x m x n``."""
-        total = torch.zeros_like(places.x[..., 0])
+        total = torch.zeros_like(places.kernel_inputs[..., 0])
         for term in self.terms:
             mean = self.mean_of(term, values)
             if term.physics is not None:
@@ -303,13 +303,13 @@ class TermSum:
 
     def evaluate(self, values: Values, places: Places) -> WeightedSum:
         r"""Return the function itself, :math:`\sum_t b_t g_t`."""
-        weights = {}
+        weights, x = {}, places.kernel_inputs
         for term in self.terms:
-            b = torch.ones_like(places.x[..., 0])
+            b = torch.ones_like(x[..., 0])
             if term.physics is not None:
                 b = places.f[term.physics] - self.center(term, values)  # f_p - c
             weights[term.name] = b
-        return WeightedSum(self.terms, values, places.x, self.mean(values, places), weights)
+        return WeightedSum(self.terms, values, x, self.mean(values, places), weights)
 
     def term(self, name: str, values: Values, places: Places) -> WeightedSum:
         r"""Return the process of a term in the user's meaning, :math:`f = \sum_t b_t g_t`.
@@ -317,11 +317,11 @@ class TermSum:
         delta is the term of this name, or the first without a basis.
         """
         term = next(t for t in self.terms if t.name == name)
-        one = torch.ones_like(places.x[..., 0])
+        one = torch.ones_like(places.kernel_inputs[..., 0])
         weights = {name: one}
         # rho (f_p - c) + delta' = rho f_p + (delta' - c (rho - 1)), but for the means
         if name == self.plain:
             centered = [t for t in self.terms if t.has_center]
             weights |= {t.name: -self.center(t, values) * one for t in centered}
         mean = self.mean_of(term, values) * one
-        return WeightedSum(self.terms, values, places.x, mean, weights)
+        return WeightedSum(self.terms, values, places.kernel_inputs, mean, weights)

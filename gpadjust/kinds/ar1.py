@@ -204,7 +204,7 @@ class LevelNoise(Noise):
 
     def shares(self, places: Places) -> Tensor:
         """Return the shares of both variances at each input, ``... x 1 x 1 x n x 2``."""
-        level = places.x[..., -1]
+        level = places.kernel_inputs[..., -1]
         return torch.stack([1 - level, level], -1)
 
     def with_known(self, known: KnownNoise) -> Noise:
@@ -220,5 +220,5 @@ class KnownAtHigh(KnownNoise):
         variances = super().variance(values, places, is_training)
         if not is_training:
             return variances
-        num_low = places.x.shape[-2] - variances.shape[-1]
+        num_low = places.kernel_inputs.shape[-2] - variances.shape[-1]
         return torch.nn.functional.pad(variances, (num_low, 0), value=_EXACT)

@@ -135,6 +135,11 @@ class Vanishing(Kernel):
         rows: list[Row] = self.kernel.rows(x, num_outputs)
         return rows
 
+    def in_user_units(self, name: str, numbers: Tensor, unit: float) -> tuple[str, Tensor]:
+        """Return the name and numbers of a parameter of k in summaries."""
+        shown: tuple[str, Tensor] = self.kernel.in_user_units(name, numbers, unit)
+        return shown
+
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the covariances of inputs with others, or with themselves; NaN if impossible."""
         # k_R (k_S - k_S(x, V) k_S(V, V)^-1 k_S(V, x')); the second factor has the variance twice.
