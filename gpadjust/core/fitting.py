@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -237,15 +238,9 @@ def _roughly_fitted(model: GP, seed: int, noise: Noise) -> GP:
 
 def _default_numbers(model: GP) -> tuple[int, int]:
     """Return the number of draws, and over how many of them predictions average."""
-    n = model.targets().shape[-1]
-    drawn = (80, 32, 16)
-    if model.table.shared:
-        drawn = (256, 128, 64)
-    if n <= _SMALL:
-        return drawn[0], 16
-    if n <= _MEDIUM:
-        return drawn[1], 8
-    return drawn[2], 4
+    size = bisect_left((_SMALL, _MEDIUM), model.targets().shape[-1])  # 0 up to 40 points, ...
+    drawn = (256, 128, 64) if model.table.shared else (80, 32, 16)
+    return drawn[size], (16, 8, 4)[size]
 
 
 def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:

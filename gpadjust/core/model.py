@@ -345,9 +345,7 @@ class GP(gpytorch.models.GP, Predictive):
     ) -> tuple[Tensor, Tensor]:
         """Return the same of few draws, with f_p and its derivatives if it has parameters."""
         values, y = self.table.values(u), self.targets()
-        places = self.places(self.data.X, values, with_physics=f is None)
-        if f is not None:
-            places = places._replace(f=f)
+        places = self.places(self.data.X, values, f)
         total = self.term_sum.evaluate(values, places)
         noise = self.noise.variance(values, places, True)
         observed = ~y.isnan()
@@ -371,24 +369,19 @@ class GP(gpytorch.models.GP, Predictive):
 
         It is NaN where f_p fails, and 0 of missing targets.
         """
-        total, _ = self._prior(u)
-        missing = self.targets().isnan()
-        return total.mean.expand(len(u), *missing.shape).masked_fill(missing, 0.0).flatten(1)
+        total, _, y = self._with_failures(u)
+        return total.mean.expand(len(u), *y.shape[1:]).masked_fill(y.isnan(), 0.0).flatten(1)
 
     def precision_times(self, u: Tensor, v: Tensor) -> Tensor:
         """Return the inverse covariance of the targets at ``S x B x P`` times ``S x (m n)``."""
-        total, noise = self._prior(u)
-        missing = self.targets().isnan()
-        v = v.reshape(len(u), *missing.shape)
-        return self.sum_likelihood(total, v, noise, ~missing, True).by_mean.flatten(1)
+        total, noise, y = self._with_failures(u)
+        v = v.reshape(len(u), *y.shape[1:])
+        return self.sum_likelihood(total, v, noise, ~y[0].isnan(), True).by_mean.flatten(1)
 
-    def _prior(self, u: Tensor) -> tuple[WeightedSum, Tensor]:
-        """Return the sum at the training inputs, NaN where f_p fails, and the noise's variances."""
+    def _with_failures(self, u: Tensor) -> tuple[WeightedSum, Tensor, Tensor]:
+        """Return what :meth:`_observed` does at coordinates, NaN where f_p fails."""
         values = self.table.values(u)
-        places = self.places(self.data.X, values, with_physics=False)
-        places = places._replace(f=self._physics_with_slopes(values, False)[0])
-        noise = self.noise.variance(values, places, True)
-        return self.term_sum.evaluate(values, places), noise
+        return self._observed(values, self._physics_with_slopes(values, False)[0])
 
     def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
@@ -557,13 +550,12 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the inputs of kernels at ``... x n x d``; a kind of data may add to them."""
         return self.data.kernel_inputs(X)
 
-    def places(self, X: Tensor, values: Values, with_physics: bool = True) -> Places:
-        """Return the inputs of kernels, physics and noise at ``... x n x d``."""
+    def places(self, X: Tensor, values: Values, f: Sequence[Tensor] | None = None) -> Places:
+        """Return the inputs of kernels and noise at ``... x n x d``, and f_p unless it is given."""
         x = self.kernel_inputs(X).unsqueeze(-3).unsqueeze(-3)
-        f: Sequence[Tensor] = []
         if self._f_train and not self._unknowns and X is self.data.X:
             f = self._f_train
-        elif with_physics:
+        elif f is None:
             f = self._physics_at(X.unsqueeze(-3), values)
         return Places(x, f, X.unsqueeze(-3).unsqueeze(-3))
 
@@ -587,9 +579,11 @@ class GP(gpytorch.models.GP, Predictive):
             self._cached = (self.u.detach().clone(), conditioning)
         return self._cached[1]
 
-    def _observed(self, values: Values) -> tuple[WeightedSum, Tensor, Tensor]:
+    def _observed(
+        self, values: Values, f: Sequence[Tensor] | None = None
+    ) -> tuple[WeightedSum, Tensor, Tensor]:
         """Return the function at the training inputs, the variances of the noise, and targets."""
-        places = self.places(self.data.X, values)
+        places = self.places(self.data.X, values, f)
         noise = self.noise.variance(values, places, True)
         return self.term_sum.evaluate(values, places), noise, self.targets().unsqueeze(-3)
 
@@ -646,7 +640,7 @@ class GP(gpytorch.models.GP, Predictive):
         unit = self.unit if has_unit else torch.ones_like(self.unit)
         with self._graph_for(X):
             values = conditioning.train.values
-            places = self.places(X, values, with_physics=False)
+            places = self.places(X, values, f=())
             mean, K = conditioning.joint(self.term_sum.term(name, values, places))
             return MixturePosterior(mean * unit, K * unit.square().unsqueeze(-1))
 

@@ -41,7 +41,8 @@ def summary_html(model: Any) -> str:
 def _lines(model: Any) -> list[str]:
     """Return the kind and size of the model, and the numbers of each output."""
     values, X = model.table.values(model.draws), model.data.X
-    variance = model.noise.variance(values, model.places(X, values, model.noise.has_shares), True)
+    f = None if model.noise.has_shares else ()
+    variance = model.noise.variance(values, model.places(X, values, f), True)
     parts = [counted(model)]
     if not model.is_fitted:
         parts.append("not fitted")
