@@ -138,9 +138,8 @@ def as_tensor(values: ArrayLike, name: str) -> Tensor:
         if values.is_complex():
             raise _no_numbers(name, [str(values.dtype)])
         if values.dtype != torch.float64:  # Cholesky factors of these kernels fail in float32
-            raise TypeError(
-                f"Expected {name} in float64; found {values.dtype}; take `{name}.double()`."
-            )
+            kind = f"{values.dtype}; take `{name}.double()`"
+            raise TypeError(f"Expected {name} in float64; found {kind}.")
         return values
     if hasattr(values, "to_frame"):  # a Series is a column
         values = values.to_frame()
@@ -149,9 +148,7 @@ def as_tensor(values: ArrayLike, name: str) -> Tensor:
         kind = type(values).__name__
         raise TypeError(f"Expected {name} as a tensor, an array or a frame; found {kind}.")
     if np.ma.is_masked(array):
-        raise ValueError(
-            f"Expected {name} unmasked; take `{name}.filled(np.nan)`, or leave out rows."
-        )
+        raise ValueError(f"Expected {name} unmasked; leave out rows or `{name}.filled(np.nan)`.")
     types = {array.dtype.type}
     if array.dtype.kind == "O":
         types = {type(value) for value in array.flat}

@@ -32,9 +32,7 @@ class OfGPyTorch(Kernel):
                 f"ScaleKernel(MaternKernel()); found {kernel!r}."
             )
         if kernel.batch_shape:
-            raise ValueError(
-                f"Expected a kernel without batch shape; found {tuple(kernel.batch_shape)}."
-            )
+            raise ValueError(f"Expected a kernel without batch shape; found {kernel.batch_shape}.")
         self.outputscale = outputscale
         self.kernel = deepcopy(kernel).double()
         self.kernel.requires_grad_(False).eval()
@@ -58,9 +56,10 @@ class OfGPyTorch(Kernel):
                 is_positive = bool((constraint.lower_bound >= 0).all())
             if is_positive:
                 factor = LENGTH_FACTOR
-            prior = priors.get(name)
-            density = prior and partial(_log_density, prior, raw.shape)
-            if prior is None and name.endswith("raw_outputscale"):
+            prior, density = priors.get(name), None
+            if prior is not None:
+                density = partial(_log_density, prior, raw.shape)
+            elif name.endswith("raw_outputscale"):
                 value = torch.full_like(value, self.outputscale.median)
                 factor = self.outputscale.factor
             if is_positive:
@@ -74,10 +73,8 @@ class OfGPyTorch(Kernel):
         lead = next((value.shape[:-1] for value in own.values()), torch.Size([1, 1]))
         if self._as_batch is None:
             self._as_batch = self._is_the_same_as_a_batch(own, x, lead)
-        if other is None:
-            other = x
         evaluate = self._of_batch if self._as_batch else self._one_by_one
-        return evaluate(own, x, other, lead)
+        return evaluate(own, x, x if other is None else other, lead)
 
     def _dense(self, kernel: AnyGPyTorchKernel, values: Values, x: Tensor, other: Tensor) -> Tensor:
         """Return covariances of a kernel at values of its parameters."""

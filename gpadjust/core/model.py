@@ -41,7 +41,7 @@ from gpadjust.core.views import MeanView, NoiseView, OtherPriors, TermView, sque
 from gpadjust.display import Display
 from gpadjust.physics import Physics, PhysicsError, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.physics.unknown import NO_UNKNOWNS, Unknowns
+from gpadjust.physics.unknown import Unknowns
 from gpadjust.progress import tick
 
 Slopes = dict[str, list[Tensor]]
@@ -227,10 +227,8 @@ class GP(gpytorch.models.GP, Predictive):
         terms = [t._replace(kernel=t.kernel and t.kernel.of_data(self.data)) for t in terms]
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
-        unknowns = [f_p.unknowns for f_p in self.physics] or [NO_UNKNOWNS]
-        self._unknowns = unknowns[0]
-        if len(unknowns) > 1:
-            self._unknowns = Unknowns.together(unknowns)
+        unknowns = [f_p.unknowns for f_p in self.physics]
+        self._unknowns = unknowns[0] if len(unknowns) == 1 else Unknowns.together(unknowns)
         # f_p at the training inputs, and the unit of the targets by it.
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
@@ -914,8 +912,7 @@ class GP(gpytorch.models.GP, Predictive):
 @DrawMatheronPaths.register(Predictive)  # type: ignore[untyped-decorator]
 def _draw_matheron_paths(model: Any, *, sample_shape: Size, **_: Any) -> Paths:
     """Draw functions for BoTorch's ``draw_matheron_paths``, by the model's own features."""
-    functions = model.sample_functions(max(1, sample_shape.numel()))
-    return Paths(functions, sample_shape)
+    return Paths(model.sample_functions(max(1, sample_shape.numel())), sample_shape)
 
 
 def _unknown_option(structure: type[GP], name: str) -> TypeError:

@@ -119,9 +119,7 @@ class Noise:
 
     def with_known(self, known: KnownNoise) -> Noise:
         """Return the noise of targets with known variances; a ValueError if it learns them."""
-        raise ValueError(
-            f"Expected train_Yvar or a noise that learns variances; found both, {self}."
-        )
+        raise ValueError(f"Expected train_Yvar or a noise of learnt variances; found both, {self}.")
 
     def of_outputs(self, outputs: Sequence[int]) -> Self:
         """Return the noise of some outputs."""

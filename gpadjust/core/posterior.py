@@ -126,8 +126,7 @@ class MixturePosterior(GPyTorchPosterior):
 
     def quantile(self, value: Tensor) -> Tensor:
         """Return quantiles ``... x q x m`` of the mixture, with several levels in front."""
-        levels = value.flatten().tolist()
-        quantiles = [self.marginals.quantile(level) for level in levels]
+        quantiles = [self.marginals.quantile(level) for level in value.flatten().tolist()]
         return torch.stack(quantiles) if value.numel() > 1 else quantiles[0]
 
     def density(self, value: Tensor) -> Tensor:

@@ -146,9 +146,7 @@ def _content(model: GP) -> dict[str, Any]:
     """Return the content of the file of a model."""
     data, n = model.data, model.rows_of_fit
     if model.batch_shape or model._outputs is not None or n > len(data.Y):
-        raise ValueError(
-            "Expected a model of one data set and all its outputs, not fantasies or a part of it."
-        )
+        raise ValueError("Expected one data set with all outputs, not fantasies or a part of it.")
     parameters = signature(type(model)).parameters.values()
     takes_physics = any(p.name == "physics" or p.kind is p.VAR_KEYWORD for p in parameters)
     paths = [import_path(f_p) for f_p in model.physics if takes_physics]
@@ -338,8 +336,7 @@ def _physics(content: dict[str, Any], trusted: bool) -> Any:
     parts = [physics_from_path(path) for path in content["physics"]]
     if content["physics_names"]:
         return dict(zip(content["physics_names"], parts, strict=True))
-    is_list = len(parts) > 1 or content["class"] == _path_of(GP)
-    return parts if is_list else parts[0]
+    return parts if len(parts) > 1 or content["class"] == _path_of(GP) else parts[0]
 
 
 def _call(names: Any) -> str:

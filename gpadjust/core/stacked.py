@@ -135,9 +135,8 @@ class StackedGP(Wrapper):
         densities = [model.left_out().log_density(model.data.Y) for model in models.values()]
         scores = torch.stack(densities).nan_to_num()  # K x n x m; 0 where one is missing
         weights = torch.full_like(scores[:, 0], 1 / len(models))
-        for _ in range(
-            _ROUNDS
-        ):  # expectation maximisation: w_k <- mean_i w_k p_ki / sum_l w_l p_li
+        # Expectation maximisation: w_k <- mean_i w_k p_ki / sum_l w_l p_li.
+        for _ in range(_ROUNDS):
             weights = (scores + weights.log().unsqueeze(1)).softmax(0).mean(1)
         return cls(models, weights, num_components)
 

@@ -226,8 +226,7 @@ def _constant(
 
 
 def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "delta") -> Term:
-    constant = _constant(constants, name, DELTA_CONSTANT)
-    return Term(name, as_kernel(kernel, DELTA), constant=constant)
+    return Term(name, as_kernel(kernel, DELTA), 0.0, _constant(constants, name, DELTA_CONSTANT))
 
 
 def _nested(rho: str, extra_terms: Sequence[Term], physics: Any) -> list[Choice]:

@@ -51,9 +51,7 @@ class Row(NamedTuple):
     def value(self, u: Tensor) -> Tensor:
         """Return the numbers at coordinates ``S x m x k`` (of a shared row ``S x k``)."""
         theta = self.location + self.scale * u  # a + b u
-        if self.is_positive:
-            theta = theta.exp()
-        return theta
+        return theta.exp() if self.is_positive else theta
 
     def coordinate(self, value: Tensor) -> Tensor:
         """Return the coordinates of numbers."""
@@ -110,8 +108,7 @@ class Table:
         self.size = self._own_size + sum(self._sizes[len(self.own) :])
         self.has_other_priors = any(row.log_density is not None for row in rows)
         shares = torch.tensor([c.probability for c in self.choices] or [1.0], dtype=torch.float64)
-        is_single = len(self.choices) == 1
-        if is_single or abs(shares.sum() - 1) > 1e-9 or (shares <= 0).any():
+        if len(self.choices) == 1 or abs(shares.sum() - 1) > 1e-9 or (shares <= 0).any():
             expected = "several choices with positive probabilities that sum to 1"
             raise ValueError(f"Expected {expected}; found {shares.tolist()}.")
         self.log_prior = shares.log()
@@ -186,8 +183,8 @@ class Table:
     def prior_draws(self, number: int, seed: int) -> Tensor:
         """Return coordinates ``number x B x P`` of draws from the prior."""
         generator = torch.Generator().manual_seed(seed)
-        shape = (number, self.problems, self.size)
-        u = standard_normal(shape, generator, self.rows[0].location)
+        like = self.rows[0].location
+        u = standard_normal((number, self.problems, self.size), generator, like)
         if not self.has_other_priors:
             return u
         # Draws from N(0, I) are resampled by p(u) / N(u | 0, I).
