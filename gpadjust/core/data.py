@@ -65,8 +65,7 @@ class Data(NamedTuple):
         if is_seldom.any():
             columns = marked_rows(is_seldom)
             raise ValueError(f"Expected at least 2 targets of each output; leave out {columns}.")
-        X = X.detach().clone()
-        Y = Y.detach().clone()
+        X, Y = (tensor.detach().clone() for tensor in (X, Y))
         Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y)
         if input_transform is not None:
             input_transform(X)

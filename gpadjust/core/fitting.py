@@ -82,9 +82,7 @@ class FitResult:
         outputs = [*zip(*self.probabilities.values(), strict=True)]
         for j, shares in enumerate(outputs):
             parts = [f"{text} {p:.2f}" for text, p in zip(self.probabilities, shares, strict=True)]
-            output = ""
-            if len(outputs) > 1:
-                output = f" (output {j + 1})"
+            output = f" (output {j + 1})" if len(outputs) > 1 else ""
             lines.append(f"Probabilities{output}: {', '.join(parts)}.")
         if self.method == "map":
             lines.append("Point fit: intervals ignore the uncertainty of the hyper-parameters.")
@@ -359,9 +357,7 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     number = max(16, 6400 // max(len(model.data.Y), 25))
     generator = torch.Generator().manual_seed(seed)
     u = standard_normal((number, *like.shape), generator, like)
-    searches = _SEARCHES
-    if choice > 0:
-        searches = _SEARCHES // 2
+    searches = _SEARCHES // 2 if choice else _SEARCHES
     begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
     if model.table.shared:
         begins[-2] = _with_least_squares(model, choice, u)

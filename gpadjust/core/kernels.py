@@ -121,14 +121,10 @@ def _matern_slope(p: int, e: Tensor) -> Tensor:
     return slope * (e < 0) if p == 0 else slope
 
 
-RBF = Profile("rbf", torch.exp, torch.exp, math.inf)
-"""The squared exponential kernel, exp(-r^2 / 2)."""
-MATERN12 = _matern(0)
-"""The exponential kernel, Matern with nu = 1/2."""
-MATERN32 = _matern(1)
-"""The Matern kernel with nu = 3/2."""
-MATERN52 = _matern(2)
-"""The Matern kernel with nu = 5/2."""
+RBF = Profile("rbf", torch.exp, torch.exp, math.inf)  # exp(-r^2 / 2)
+MATERN12 = _matern(0)  # nu = 1/2, the exponential kernel
+MATERN32 = _matern(1)  # nu = 3/2
+MATERN52 = _matern(2)  # nu = 5/2
 
 
 def exponents(z: Tensor, other: Tensor | None = None) -> Tensor:

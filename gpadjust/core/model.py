@@ -24,14 +24,7 @@ from torch import Size, Tensor
 
 from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
-from gpadjust.core.gaussian import (
-    Conditioning,
-    Marginals,
-    Prediction,
-    SumLikelihood,
-    add_noise,
-    sum_likelihood,
-)
+from gpadjust.core.gaussian import Conditioning, Marginals, Prediction, SumLikelihood, add_noise
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.summary import counted, summary, summary_html
@@ -199,8 +192,8 @@ class GP(gpytorch.models.GP, Predictive):
             raise _unknown_option(type(self), next(iter(others)))
         for name, option in {"noise": noise, "input_transform": input_transform}.items():
             if isinstance(option, type):
-                kind = option.__name__
-                raise TypeError(f"Expected {name} as an instance, {kind}(); found the class.")
+                expected = f"an instance, {option.__name__}()"
+                raise TypeError(f"Expected {name} as {expected}; found the class.")
         if outcome_transform is not None and not isinstance(outcome_transform, Standardize):
             raise ValueError(
                 "Expected outcome_transform=None or Standardize, which has no effect; found "
@@ -386,7 +379,7 @@ class GP(gpytorch.models.GP, Predictive):
         with_gradient: bool,
     ) -> SumLikelihood:  # fmt: skip
         """Return the log likelihood of residuals ``S x m x n``; a subclass may bound it."""
-        return sum_likelihood(train, residual, noise, observed, with_gradient)
+        return SumLikelihood.compute(train, residual, noise, observed, with_gradient)
 
     def conditioned(
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Any = None
@@ -526,9 +519,7 @@ class GP(gpytorch.models.GP, Predictive):
         X = self.data.X
         names = [*self._unknowns]
         z = torch.cat([values[f"physics.{name}"] for name in names], -1)  # S x p
-        p = 0
-        if with_slopes:
-            p = len(names)
+        p = len(names) if with_slopes else 0
         steps = _STEP * torch.eye(p, len(names)).to(z).unsqueeze(1)
         # Central differences, by one call: (1 + 2 p) x S x p.
         shifted = torch.cat([z.unsqueeze(0), z + steps, z - steps])
@@ -698,11 +689,9 @@ class GP(gpytorch.models.GP, Predictive):
         is_right = shape[-2:-1] in ((1,), (q,)) and shape[-1] in (1, m)
         if isinstance(noise, Tensor) and is_right and (noise >= 0).all():
             return noise.expand(*shape[:-2], q, m)
-        if not isinstance(noise, Tensor):
-            shape = noise
         raise ValueError(
             f"Expected noise as True, False or variances ... x {q} x {m}, not negative or NaN; "
-            f"found {shape!r}. Known noise belongs to the model, in train_Yvar."
+            f"found {shape or noise!r}. Known noise belongs to the model, in train_Yvar."
         )
 
     # Other data, outputs and draws.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from scipy.optimize import minimize
@@ -12,13 +13,8 @@ from torch import Tensor
 
 from gpadjust.core.unknowns import standard_normal
 
-
-class LogLikelihood(Protocol):
-    """The log likelihood of coordinates of ``B`` independent problems."""
-
-    def __call__(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
-        """Return values ``N x B`` at ``N x B x P``, and gradients (zeros if not asked for)."""
-
+LogLikelihood = Callable[..., tuple[Tensor, Tensor]]
+"""Of coordinates ``N x B x P`` and ``with_gradient``: values ``N x B`` of problems, and slopes."""
 
 GROUPS = 2  # of draws that are resampled apart; their difference is the error
 _SHARE = 0.5  # of the resulting draws, that count after each step of the power
@@ -103,9 +99,7 @@ def sample(
     u = begin.mean + (begin.root @ points.unsqueeze(-1)).squeeze(-1)
     value, slope = ratio(u, False)
     power = like.new_zeros(shape[0])
-    least = 0.0
-    if with_moves:
-        least = _SHARE * number
+    least = _SHARE * number if with_moves else 0.0  # draws that count
     evidence = like.new_zeros(GROUPS, shape[0])
     length = torch.full_like(power, _FIRST_LENGTH)
     problems = torch.arange(shape[0], device=like.device)
@@ -253,12 +247,8 @@ def maximise(
         density = density.nan_to_num(neginf=-1e10)
         return -float(density.sum()), (point - slope).nan_to_num().flatten().cpu().numpy()
 
-    options: dict[str, float] = {"maxiter": most, "ftol": 1e-5}
-    searches = 1
-    if is_precise:
-        searches = _SEARCHES
-        del options["ftol"]
-    for _ in range(searches):
+    options = {"maxiter": most} if is_precise else {"maxiter": most, "ftol": 1e-5}
+    for _ in range(_SEARCHES if is_precise else 1):
         before = float(top.nan_to_num(neginf=-1e10).sum())
         start = best.flatten().cpu().numpy()
         minimize(negative, start, jac=True, method="L-BFGS-B", options=options)

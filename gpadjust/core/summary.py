@@ -132,7 +132,9 @@ def numbers_of(model: Any, u: Tensor) -> dict[tuple[str, str], Number]:
     numbers = {}
     parameters = model.physics_parameters_at(u)
     for i, (name, unknown) in enumerate(parameters.unknowns.items()):
-        meaning = "a parameter of the physics" + (unknown.unit and f", in {unknown.unit}")
+        meaning = "a parameter of the physics"
+        if unknown.unit:
+            meaning += f", in {unknown.unit}"
         numbers["", name] = Number(name, parameters.draws[:, i], meaning)
     noise = model.noise.variance(values, model.places(model.data.X, values), True)
     for j, output in enumerate(model.data.output_names):
@@ -149,6 +151,9 @@ def numbers_of(model: Any, u: Tensor) -> dict[tuple[str, str], Number]:
 
 def _labels(model: Any, term: Term, name: str, number: int) -> list[str]:
     """Return labels of a kernel's numbers: the inputs, if it has a lengthscale of each."""
+    labels = [""] if number == 1 else [f" {i + 1}" for i in range(number)]
+    if not name.endswith("lengthscale"):
+        return labels
     names, transform, after = getattr(term.kernel, "input_names", None), model.data.transform, ""
     if names is None:
         names = model.data.input_names
@@ -156,14 +161,9 @@ def _labels(model: Any, term: Term, name: str, number: int) -> list[str]:
             names = transform.column_names(names)
         elif transform is not None:
             after = " after the transform"
-    is_length = name.endswith("lengthscale")
-    if is_length and number == len(names):
-        return [f" of {name}{after}" for name in names]
-    if not is_length:
-        after = ""
-    if number == 1:
-        return [after]
-    return [f" {i + 1}{after}" for i in range(number)]
+    if number == len(names):
+        labels = [f" of {name}" for name in names]
+    return [f"{label}{after}" for label in labels]
 
 
 def _of_noise(model: Any, sd: Tensor, j: int) -> list[str]:
