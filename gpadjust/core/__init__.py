@@ -3,7 +3,7 @@
 Read it in this order: ``unknowns``, ``data``, ``kernels``, ``terms``, ``noise``, ``gaussian``,
 ``sample``, ``straight``, ``nuts``, ``fitting``, ``model``, ``structures``. What follows from these:
 ``posterior``, ``functions`` (samples of functions), ``summary``, ``views`` (the model for
-GPyTorch), ``stacked``, ``saving``, ``threads``; ``fourier`` and ``gpytorch_kernels`` are kernels.
+GPyTorch), ``stacked``, ``saving``; ``fourier`` and ``gpytorch_kernels`` are kernels.
 """
 
 from gpadjust.core.data import Data

@@ -205,18 +205,6 @@ def names_of(values: ArrayLike, letter: str) -> tuple[str, ...]:
     return tuple(f"{letter}{i + 1}" for i in range(int(shape[-1])))
 
 
-def columns_of(names: Sequence[str], asked: Any, what: str) -> list[int]:
-    """Return the numbers of columns that are asked for, one or several, by name or number."""
-    numbers: dict[Any, int] = {name: i for i, name in enumerate(names)}
-    numbers |= {i: i % len(names) for i in range(-len(names), len(names))}
-    several = [asked] if isinstance(asked, str | int) else [*asked]
-    unknown = [column for column in several if column not in numbers]
-    if unknown:
-        expected = f"{what} by names or numbers of the inputs {', '.join(names)}"
-        raise ValueError(f"Expected {expected}; found {unknown[0]!r}.")
-    return [numbers[column] for column in several]
-
-
 def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     """Return the names of a frame's columns or of a Series, or None."""
     if hasattr(values, "columns"):

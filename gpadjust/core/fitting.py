@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from bisect import bisect_left
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
@@ -18,10 +17,10 @@ from gpadjust.core.noise import Noise
 from gpadjust.core.nuts import CHAINS, nuts
 from gpadjust.core.sample import GROUPS, Draws, Normal, around_mode, maximise, sample
 from gpadjust.core.straight import Straight
-from gpadjust.core.threads import threads_for
 from gpadjust.core.unknowns import standard_normal
 from gpadjust.physics.least_squares import least_squares_fit
 from gpadjust.progress import long_work
+from gpadjust.threads import threads_for
 
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
@@ -107,18 +106,17 @@ def fit(
     ``"bayes"`` draws all unknown numbers from their posterior: by sequential Monte Carlo from the
     prior up to 40 points, from Laplace's approximation beyond; beyond 100 points (200 if outputs
     share unknown numbers, as parameters of a physics) its draws are weighted once and not moved.
-    Nested models are drawn from apart and pooled by their posterior probabilities. ``"map"``
-    finds the most likely numbers of the whole model. ``"nuts"`` draws from the same density by
-    Pyro's NUTS, in four chains that also jump around draws of the default fit: a slow reference, of
-    a model without nested ones. After five seconds a bar of tqdm shows the progress.
+    Nested models are pooled by their posterior probabilities. ``"map"`` finds the most likely
+    numbers of the whole model. ``"nuts"`` is a slow reference without nested models: Pyro's NUTS in
+    four chains that also jump around draws of the default fit. A bar shows progress after 5 s.
 
     Args:
         model: The model.
         method: ``"bayes"``, ``"map"`` or ``"nuts"``.
         num_draws: Number of draws, a multiple of 4 (of NUTS from 16 on); predictions average over a
             quarter of them. Default: 80, 32 (of more than 40 points) or 16 (of more than 100), or
-            256, 128 or 64 if outputs share unknown numbers, as parameters of a physics; predictions
-            then average over 16, 8 or 4 of them. Of NUTS 640, after half as many to adapt.
+            256, 128 or 64 if outputs share unknown numbers; predictions then average over 16, 8 or
+            4 of them. Of NUTS 640, after half as many to adapt.
         seed: Seed.
 
     Warns:
@@ -251,9 +249,8 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
         sampled |= _around_ridges(model, sampled, number, seed)
     elif not is_small:
         sampled = _around_modes(model, number, seed)
-    return {
-        k: draws._replace(u=model.table.with_choice(draws.u, k)) for k, draws in sampled.items()
-    }
+    with_choice = model.table.with_choice
+    return {k: draws._replace(u=with_choice(draws.u, k)) for k, draws in sampled.items()}
 
 
 def _from_prior(model: GP, number: int, seed: int) -> dict[int, Draws]:
@@ -274,10 +271,7 @@ def _around_modes(model: GP, number: int, seed: int) -> dict[int, Draws]:
 
 
 def _around_ridges(model: GP, others: dict[int, Draws], number: int, seed: int) -> dict[int, Draws]:
-    """Return the same of parameters of a physics, in coordinates in which ridges are straight.
-
-    What others reach beyond these coordinates, draws from the prior, is added.
-    """
+    """Return the same in coordinates in which ridges are straight, and what others reach beyond."""
     like, with_moves = model.u.detach()[0], model.targets().shape[-1] <= _SHARED
     sampled = {}
     for k, start in _starts(model, seed).items():
@@ -422,7 +416,7 @@ def _evidence(model: GP, sampled: dict[int, Draws]) -> Tensor:
 
 
 def _pooled(
-    draws: Mapping[int, Draws], weights: Tensor, number: int, group: slice = slice(None)
+    draws: dict[int, Draws], weights: Tensor, number: int, group: slice = slice(None)
 ) -> Tensor:
     """Return ``number x B x P`` draws of nested models, all or a group, by weights ``K x B``."""
     problems = []

@@ -89,20 +89,19 @@ class SumLikelihood(NamedTuple):
     by_mean: Tensor  # S x m x n
     by_variance: Tensor  # by the variances of the noise, S x m x n
 
-    @classmethod
-    def compute(
-        cls, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
-        with_gradient: bool,
-    ) -> SumLikelihood:  # fmt: skip
-        """Return the likelihood of residuals ``S x m x n`` of a sum; 0 where not observed."""
-        if not with_gradient:
-            K = train.cross(train).expand(*residual.shape, residual.shape[-1])
-            value = log_likelihood(residual, K, noise, observed, False).value
-            return cls(value, {}, residual, residual)
-        K, pull_back = train.with_pull_back()
-        K = K.expand(*residual.shape, residual.shape[-1])
-        value, by_mean, D = log_likelihood(residual, K, noise, observed)
-        return cls(value, pull_back(D), by_mean, D.diagonal(dim1=-1, dim2=-2))
+
+def sum_likelihood(
+    train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor, with_gradient: bool
+) -> SumLikelihood:
+    """Return the likelihood of residuals ``S x m x n`` of a sum; 0 where not observed."""
+    if not with_gradient:
+        K = train.cross(train).expand(*residual.shape, residual.shape[-1])
+        value = log_likelihood(residual, K, noise, observed, False).value
+        return SumLikelihood(value, {}, residual, residual)
+    K, pull_back = train.with_pull_back()
+    K = K.expand(*residual.shape, residual.shape[-1])
+    value, by_mean, D = log_likelihood(residual, K, noise, observed)
+    return SumLikelihood(value, pull_back(D), by_mean, D.diagonal(dim1=-1, dim2=-2))
 
 
 class Conditioning:

@@ -74,7 +74,9 @@ class OfGPyTorch(Kernel):
         if self._as_batch is None:
             self._as_batch = self._is_the_same_as_a_batch(own, x, lead)
         evaluate = self._of_batch if self._as_batch else self._one_by_one
-        return evaluate(own, x, x if other is None else other, lead)
+        if other is None:
+            other = x
+        return evaluate(own, x, other, lead)
 
     def _dense(self, kernel: AnyGPyTorchKernel, values: Values, x: Tensor, other: Tensor) -> Tensor:
         """Return covariances of a kernel at values of its parameters."""

@@ -22,9 +22,10 @@ from gpytorch.priors import NormalPrior
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
+from gpadjust.core import gaussian
 from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
-from gpadjust.core.gaussian import Conditioning, Marginals, Prediction, SumLikelihood, add_noise
+from gpadjust.core.gaussian import Conditioning, Marginals, Prediction, SumLikelihood
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.summary import counted, summary, summary_html
@@ -57,8 +58,7 @@ class Predictive(Model, FantasizeMixin, Display):
 
         Args:
             X: Inputs, ``... x q x d``.
-            observation_noise: If True, include observation noise; or its variances,
-                ``... x q x m``.
+            observation_noise: If True, with that noise; or its variances, ``... x q x m``.
 
         Returns:
             Mean and variance, ``... x q x m``: tensors, arrays or frames, as ``X``.
@@ -113,10 +113,7 @@ class Predictive(Model, FantasizeMixin, Display):
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
     ) -> Any:  # fmt: skip
-        """Return the joint posterior at ``X`` in BoTorch's form.
-
-        Its mean is ``... x q x m``, for ``X`` of ``... x q x d``.
-        """
+        """Return the joint posterior at ``... x q x d`` in BoTorch's form: ``... x q x m``."""
         self.eval()
         outputs: list[int] | slice = slice(None)
         if output_indices is not None:
@@ -356,10 +353,7 @@ class GP(gpytorch.models.GP, Predictive):
         return value.masked_fill(fails, -torch.inf), gradient.masked_fill(fails.unsqueeze(-1), 0.0)
 
     def prior_mean(self, u: Tensor) -> Tensor:
-        """Return the mean of the targets at coordinates ``S x B x P``, ``S x (m n)``, in units.
-
-        It is NaN where f_p fails, and 0 of missing targets.
-        """
+        """Return the mean of the targets at u, ``S x (m n)``: NaN where f_p fails, 0 if missing."""
         total, _, y = self._with_failures(u)
         return total.mean.expand(len(u), *y.shape[1:]).masked_fill(y.isnan(), 0.0).flatten(1)
 
@@ -379,7 +373,7 @@ class GP(gpytorch.models.GP, Predictive):
         with_gradient: bool,
     ) -> SumLikelihood:  # fmt: skip
         """Return the log likelihood of residuals ``S x m x n``; a subclass may bound it."""
-        return SumLikelihood.compute(train, residual, noise, observed, with_gradient)
+        return gaussian.sum_likelihood(train, residual, noise, observed, with_gradient)
 
     def conditioned(
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Any = None
@@ -519,7 +513,9 @@ class GP(gpytorch.models.GP, Predictive):
         X = self.data.X
         names = [*self._unknowns]
         z = torch.cat([values[f"physics.{name}"] for name in names], -1)  # S x p
-        p = len(names) if with_slopes else 0
+        p = 0
+        if with_slopes:
+            p = len(names)
         steps = _STEP * torch.eye(p, len(names)).to(z).unsqueeze(1)
         # Central differences, by one call: (1 + 2 p) x S x p.
         shifted = torch.cat([z.unsqueeze(0), z + steps, z - steps])
@@ -612,7 +608,7 @@ class GP(gpytorch.models.GP, Predictive):
         with self._graph_for(X):
             mean, K = conditioning.joint(self.evaluate(X, conditioning.train.values))
             if observation_noise is not False:
-                K = add_noise(K, self._noise_at(X, observation_noise))
+                K = gaussian.add_noise(K, self._noise_at(X, observation_noise))
             mean, K = mean * self.unit, K * self.unit.square().unsqueeze(-1)
             return MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :])
 
@@ -737,8 +733,8 @@ class GP(gpytorch.models.GP, Predictive):
 
     def set_train_data(self, *_: Any, **__: Any) -> NoReturn:
         """Raise an error: the data of a model stay."""
-        way_out = "model.condition_on_observations(X, Y) returns one with further rows"
-        raise NotImplementedError(f"The data of a model stay; build another one, or {way_out}.")
+        way_out = "build another one, or take model.condition_on_observations(X, Y)"
+        raise NotImplementedError(f"The data of a model stay: {way_out}.")
 
     def get_fantasy_model(self, inputs: Any, targets: Tensor, **options: Any) -> Self:
         """Condition on targets ``... x (m) x k``, as GPyTorch's lists of models do."""
@@ -921,7 +917,7 @@ def _coordinates(model: GP) -> Tensor:
     """Return the coordinates of a single draw, ``m x P``, for their prior."""
     u, m = model.u[0], model.num_outputs
     if len(u) == m:
-        return u if m > 1 else u[0]
+        return u.squeeze(0)
     return u.expand(m, -1) / m**0.5  # each output adds its share of -u^2 / 2
 
 

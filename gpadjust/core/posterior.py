@@ -68,7 +68,10 @@ class MixturePosterior(GPyTorchPosterior):
         """``... x q m``, and of several components one more, which picks the component."""
         mean, _ = self.gaussians
         S, m, q = mean.shape[-3:]
-        return Size([*mean.shape[:-3], q * m if S == 1 else q * m + 1])
+        size = q * m
+        if S > 1:
+            size += 1
+        return Size([*mean.shape[:-3], size])
 
     @property
     def marginals(self) -> Marginals:
@@ -118,7 +121,7 @@ class MixturePosterior(GPyTorchPosterior):
     def quantile(self, value: Tensor) -> Tensor:
         """Return quantiles ``... x q x m`` of the mixture, with several levels in front."""
         quantiles = [self.marginals.quantile(level) for level in value.flatten().tolist()]
-        return torch.stack(quantiles) if value.numel() > 1 else quantiles[0]
+        return torch.stack(quantiles).squeeze(0)
 
     def density(self, value: Tensor) -> Tensor:
         """Return the density of each output at each point, at values ``... x q x m``."""

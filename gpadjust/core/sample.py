@@ -247,8 +247,12 @@ def maximise(
         density = density.nan_to_num(neginf=-1e10)
         return -float(density.sum()), (point - slope).nan_to_num().flatten().cpu().numpy()
 
-    options = {"maxiter": most} if is_precise else {"maxiter": most, "ftol": 1e-5}
-    for _ in range(_SEARCHES if is_precise else 1):
+    options: dict[str, float] = {"maxiter": most}
+    searches = _SEARCHES
+    if not is_precise:
+        searches = 1
+        options["ftol"] = 1e-5
+    for _ in range(searches):
         before = float(top.nan_to_num(neginf=-1e10).sum())
         start = best.flatten().cpu().numpy()
         minimize(negative, start, jac=True, method="L-BFGS-B", options=options)

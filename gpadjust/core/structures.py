@@ -12,6 +12,7 @@ from gpadjust.core.model import GP
 from gpadjust.core.terms import Term, as_kernel
 from gpadjust.core.unknowns import Choice, LogNormal
 
+Constants = bool | Mapping[str, LogNormal]
 RHO_CONSTANT = LogNormal(0.01, 100.0)  # prior variance of a constant in rho, or of rho alone
 DELTA_CONSTANT = LogNormal(0.3, 1000.0)  # that in delta, in squared units of the targets
 
@@ -216,16 +217,14 @@ def _scalings(physics: Any, means: Any = None) -> tuple[list[Term], list[Any]]:
     return [Term(names[i], mean=float(means[i]), physics=i) for i in range(number)], functions
 
 
-def _constant(
-    constants: bool | Mapping[str, LogNormal], name: str, prior: LogNormal
-) -> LogNormal | None:
+def _constant(constants: Constants, name: str, prior: LogNormal) -> LogNormal | None:
     """Return the prior of a term's constant, None without one."""
     if isinstance(constants, Mapping):
         return LogNormal(*constants.get(name, prior))
     return prior if constants else None
 
 
-def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "delta") -> Term:
+def _delta(kernel: Any, constants: Constants, name: str = "delta") -> Term:
     return Term(name, as_kernel(kernel, DELTA), 0.0, _constant(constants, name, DELTA_CONSTANT))
 
 

@@ -238,11 +238,9 @@ class TermSum:
         names = [term.name for term in terms]
         if len({*names}) < len(names) or not names or any("." in name for name in names):
             raise ValueError(f"Expected terms with different names without dots; found {names}.")
-        for term in terms:
-            if term.physics is not None and not 0 <= term.physics < len(f):
-                raise ValueError(
-                    f"Term {term.name!r} has physics number {term.physics} of {len(f)} in physics=."
-                )
+        for name, i in ((t.name, t.physics) for t in terms if t.physics is not None):
+            if not 0 <= i < len(f):
+                raise ValueError(f"Term {name!r} has physics number {i} of {len(f)} in physics=.")
         self.terms = tuple(
             term._replace(has_center=term.physics is not None and term.has_center) for term in terms
         )

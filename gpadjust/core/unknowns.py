@@ -51,7 +51,9 @@ class Row(NamedTuple):
     def value(self, u: Tensor) -> Tensor:
         """Return the numbers at coordinates ``S x m x k`` (of a shared row ``S x k``)."""
         theta = self.location + self.scale * u  # a + b u
-        return theta.exp() if self.is_positive else theta
+        if self.is_positive:
+            theta = theta.exp()
+        return theta
 
     def coordinate(self, value: Tensor) -> Tensor:
         """Return the coordinates of numbers."""

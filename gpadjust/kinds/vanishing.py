@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_finite
-from gpadjust.core.data import Data, as_tensor, columns_of
+from gpadjust.checks import check_finite, checked_columns
+from gpadjust.core.data import Data, as_tensor
 from gpadjust.core.kernels import Features, Kernel
 from gpadjust.core.terms import Term, as_kernel
 from gpadjust.core.unknowns import LogNormal, Row, Values
@@ -107,7 +107,8 @@ class Vanishing(Kernel):
                 "values of some columns as a dictionary."
             )
         places = data.X.new_full((len(self.values), d), torch.nan)
-        places[:, columns_of(data.input_names, self.columns, "`where`")] = self.values.to(places)
+        columns = checked_columns("`where`", self.columns, data.input_names)
+        places[:, columns] = self.values.to(places)
         is_free = places.isnan()  # columns R
         terms = getattr(data.transform, "terms", lambda terms: terms)
         new.kernel = terms([Term("k", self.kernel)])[0].kernel.of_data(data)
