@@ -140,7 +140,7 @@ def fit(
             f"Expected a model of gpadjust.core; found {type(model).__name__}. Of a list fit each "
             "model: for part in model.models: fit(part)."
         )
-    if method not in _METHODS:
+    if method not in tuple(_METHODS):
         raise ValueError(f"Unknown method {method!r}; expected 'bayes', 'map' or 'nuts'.")
     if method == "nuts" and not model.has_density:
         kind = type(model).__name__
@@ -234,7 +234,7 @@ def _roughly_fitted(model: GP, seed: int, noise: Noise) -> GP:
 
 def _default_numbers(model: GP) -> tuple[int, int]:
     """Return the number of draws, and over how many of them predictions average."""
-    size = bisect_left((_SMALL, _MEDIUM), model.targets().shape[-1])  # 0 up to 40 points, ...
+    size = bisect_left((_SMALL, _MEDIUM), model.targets().shape[-1])  # up to 40, 100
     drawn = (256, 128, 64) if model.table.shared else (80, 32, 16)
     return drawn[size], (16, 8, 4)[size]
 
