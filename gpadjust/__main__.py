@@ -46,7 +46,9 @@ example: swing.csv has the columns "time [s]", "angle [rad]" and "torque [N m]",
         --unknown "l [m] = 0.5 */ 1.5" --unknown "c [1/s] = 0.1 */ 2" --unknown "J = 0.3 */ 1.5"
 
 writes identify.html. Of a Python module, --physics module:name is a physics of the library, or a
-function of rows of states and actions to the next states.
+function of rows of states and actions to the next states. In Python alone, as options of
+gpadjust.records.identify: sensors with unknown gains, offsets and delays, and a fit to free runs
+(by_free_runs=True). The page ends with the program to add them to.
 """
 # An option a paragraph: its name, what the help calls its value, and what it is.
 _OPTIONS = """\

@@ -165,9 +165,9 @@ def checked_bounds(
             f"and then the upper ones, got {tuple(bounds.shape)}."
         )
     if (finite and not bounds.isfinite().all()) or not (bounds[0] < bounds[1]).all():
+        expected = f"finite {name}" if finite else name
         raise ValueError(
-            f"Expected {'finite ' * finite}{name}, each lower one below its upper one, got "
-            f"{bounds.tolist()}."
+            f"Expected {expected}, each lower one below its upper one, got {bounds.tolist()}."
         )
     return bounds
 
@@ -248,7 +248,9 @@ def check_transform(transform: Any, X: Tensor) -> None:
 def _check_rows(name: str, is_wrong: Tensor, expected: str) -> None:
     if is_wrong.any():
         rows = marked_rows(is_wrong)
-        first = ", ".join([*map(str, rows[:5]), *["..."] * (len(rows) > 5)])
+        first = ", ".join(map(str, rows[:5]))
+        if len(rows) > 5:
+            first += ", ..."
         rows_of = f"{len(rows)} of {is_wrong.shape[-1]} rows (row {first})"
         raise ValueError(f"Expected {name} {expected} in {rows_of}; remove these points.")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence, Sized
 
 from torch import Tensor
 
@@ -27,15 +27,46 @@ def percent(share: float | Tensor) -> str:
     return f"{100 * float(share):.0f} %"
 
 
+def noun_for(count: int, noun: str) -> str:
+    """Return a noun as it follows a count: ``row`` or ``rows``."""
+    if count == 1:
+        return noun
+    return f"{noun}s"
+
+
 def plural(count: int, noun: str) -> str:
     """Return a count with its noun, such as ``1 row`` or ``2 rows``."""
-    return f"{count:,} {noun}" + "s" * (count != 1)
+    return f"{count:,} {noun_for(count, noun)}"
 
 
 def listed(items: Iterable[str]) -> str:
     """Return items as a text, such as ``a, b and c``."""
     *first, last = [*items] or [""]
-    return " and ".join([", ".join(first)] * bool(first) + [last])
+    if not first:
+        return last
+    return f"{', '.join(first)} and {last}"
+
+
+def shortened(items: Sequence[str], most: int) -> list[str]:
+    """Return the first of some items, and how many more there are."""
+    if len(items) <= most:
+        return [*items]
+    return [*items[:most], f"{len(items) - most} more"]
+
+
+def noted(text: str, note: str) -> str:
+    """Return a text with a note in brackets, such as ``line 3 (outlier)``; alone without a note."""
+    return f"{text} ({note})" if note else text
+
+
+def name_among(name: str, names: Sized) -> str:
+    """Return a name; empty if it is the only one, which needs none."""
+    return name if len(names) > 1 else ""
+
+
+def about(subjects: Iterable[str], text: str) -> str:
+    """Return a text behind the names of its subjects, such as ``head: too low``, but empty ones."""
+    return ": ".join([*filter(None, subjects), text])
 
 
 def name_and_unit(name: str) -> tuple[str, str]:

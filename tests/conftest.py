@@ -6,11 +6,14 @@ from itertools import combinations
 
 import pytest
 import torch
+from hypothesis import settings
 
 from tests import systems
 from tests.systems import truth
 
 torch.set_num_threads(1)
+settings.register_profile("unhurried", deadline=None)  # a busy machine is no failure
+settings.load_profile("unhurried")
 
 
 @pytest.fixture(autouse=True)

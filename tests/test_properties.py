@@ -169,7 +169,7 @@ each_model = pytest.mark.parametrize("name", MODELS)
 
 
 @every
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(at=st.lists(st.floats(-2, 3), min_size=1, max_size=3), level=st.floats(0.9, 0.999))
 def test_a_prediction_lies_within_its_interval(name, at, level):
     model, problem = made(name)

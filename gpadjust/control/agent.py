@@ -315,7 +315,8 @@ class Agent(ABC, Display):
         data = self.recorded_episodes()
         is_new = data.episode >= self.num_episodes
         new = data.subset(is_new) if dynamics.has_learnt else data
-        if len(new) < 2 - dynamics.is_fitted:  # a first fit needs two
+        is_enough = len(new) > 1 or (len(new) == 1 and dynamics.is_fitted)  # a first fit needs two
+        if not is_enough:
             if len(new):
                 self._can_act = None  # there is another start
             return

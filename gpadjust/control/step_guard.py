@@ -74,7 +74,8 @@ class StepGuard(gym.Wrapper[Any, Any, Any, Any]):
             self._in_vain = 0
             return result
         message = f"Step {self._steps + 1} of an episode failed, and ends it: {problem}."
-        self._in_vain += self._steps == 0
+        if not self._steps:
+            self._in_vain += 1
         if self._in_vain >= _IN_VAIN:
             self._in_vain = 0
             raise RuntimeError(

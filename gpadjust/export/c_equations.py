@@ -99,12 +99,16 @@ def equations_source(fitted: OfPhysics, name: str, free: bool) -> Iterator[str]:
     state, action = entries("state", spec.state_dim), entries("action", spec.action_dim)
     x = [(*state, *action)[i] for i in spec.physics_columns]
     f_p = entries("f_p", len(equations.formula.outputs))
-    declared = ", const double *parameters" * free
-    yield f"void {name}_step(const double *state, const double *action{declared}, double *mean)"
+    inputs = ["const double *state", "const double *action"]
+    values = ["x", "f_p"]
+    if free:
+        inputs.append("const double *parameters")
+        values.insert(1, "parameters")
+    yield f"void {name}_step({', '.join(inputs)}, double *mean)"
     yield "{"
     yield f"    const double x[] = {braced(x)};"
     yield f"    double f_p[{len(f_p)}];"
-    yield f"    {name}_predict(x{', parameters' * free}, f_p);"
+    yield f"    {name}_predict({', '.join(values)});"
     # All of them are there before `mean` is written, which may be `state`.
     yield f"    const double next[] = {braced(following_state(spec, state, action, f_p))};"
     yield f"    for (int i = 0; i < {spec.state_dim}; i++) mean[i] = next[i];"
@@ -150,8 +154,14 @@ def physics_lines(
     yield from curves  # before the function that calls them
     if any(f"{name}_sign(" in output for output in outputs):
         yield _SIGN.format(name)
-    declared = "const double *x" + ", const double *parameters" * free
-    head = f"{'static ' * is_static}void {name}({declared}, double *mean)\n{{"
+    declared = "const double *x"
+    passed = ""  # to the rates of a stage
+    if free:
+        declared += ", const double *parameters"
+        passed = ", parameters"
+    head = f"void {name}({declared}, double *mean)\n{{"
+    if is_static:
+        head = f"static {head}"
     if ode is None:
         yield from (head, *_assigned("mean", outputs, free), "}\n")
         return
@@ -168,11 +178,14 @@ def physics_lines(
         states=ode.state_dim,
         substeps=ode.substeps,
         rates=f"{name}_rates",
-        parameters=", parameters" * free,
+        parameters=passed,
         h=repr(ode.step / ode.substeps),
     ).rstrip()
     for i in range(ode.state_dim):
-        yield f"    mean[{i}] = at[{i}]{f' - {x[i]}' * ode.difference};"
+        mean = f"at[{i}]"
+        if ode.difference:
+            mean += f" - {x[i]}"
+        yield f"    mean[{i}] = {mean};"
     yield "}\n"
 
 

@@ -168,11 +168,14 @@ def c_source(
     dynamics = fitted if isinstance(fitted, LearnedDynamics) else None
     spec = getattr(dynamics, "spec", None)
     about = [*_about(model, terms.num_physics, bool(within), spec, observation_noise)]
-    outputs = ["double *mean", *["double *variance"] * variance]
-    f_p = ["const double *f_p"] * (is_argument or (bool(within) and dynamics is not None))
     body = "".join(_body(terms, variance))
-    if within and dynamics is None:
+    # A model calls equations of the file itself; dynamics do it in their step.
+    has_f_p = is_argument
+    if within and dynamics is not None:
+        has_f_p = True
+    elif within:
         body = "".join(f"    {line}\n" for line in _own_f_p(within, name, "x")) + body
+    arguments = ["const double *x", *_arguments(has_f_p, variance)]
     tables = {n: t for n, t in _tables(terms).items() if re.search(rf"\b{n}\[", body)}
     about.append(f"Numbers in tables: {sum(table.numel() for table in tables.values())}.")
     sizes = {
@@ -182,24 +185,36 @@ def c_source(
         "FEATURES": terms.weights.shape[-1],
         "POINT_SETS": len(terms.points),
     }
-    static = "static " * (dynamics is not None)
+    head = f"void {name}_predict({', '.join(arguments)})"
+    if dynamics is not None:
+        head = f"static {head}"
     lines = [
         f"enum {{ {', '.join(f'{n} = {size}' for n, size in sizes.items())} }};",
         *(_declared(*table) for table in tables.items()),
         "",
-        f"{static}void {name}_predict(const double *x, {', '.join(f_p + outputs)})",
+        head,
         f"{{\n{body}    }}\n}}",
     ]
     # Sizes and tables get a prefix, so that one unit may contain several models.
     local = "|".join([*sizes, *tables])
     code = [re.sub(rf"(?<!_)\b({local})\b", rf"{name}_\1", "\n".join(lines))]
     if dynamics is not None:
-        arguments = ["const double *f_p"] * is_argument + outputs
+        arguments = _arguments(is_argument, variance)
         code += ["", *_step(dynamics, name, arguments, terms.num_physics, within)]
-    head = [*comment(about), "#include <math.h>", ""]
+    beginning = [*comment(about), "#include <math.h>", ""]
     for i, equations in enumerate(within):
-        head += physics_lines(equations, f"{name}_f_p{i}")
-    return "\n".join(head + code) + "\n"
+        beginning += physics_lines(equations, f"{name}_f_p{i}")
+    return "\n".join(beginning + code) + "\n"
+
+
+def _arguments(has_f_p: bool, variance: bool) -> list[str]:
+    """Return the arguments of a function of C after its inputs."""
+    arguments = ["double *mean"]
+    if has_f_p:
+        arguments.insert(0, "const double *f_p")
+    if variance:
+        arguments.append("double *variance")
+    return arguments
 
 
 def _own_f_p(within: list[Equations], name: str, x: str) -> Iterator[str]:
@@ -211,9 +226,11 @@ def _own_f_p(within: list[Equations], name: str, x: str) -> Iterator[str]:
 
 def _about(model: GP, num_physics: int, is_within: bool, spec: Any, noise: bool) -> Iterator[str]:
     """Yield lines on the content of the file."""
-    place = ", which is in this file" * is_within
     yield f"{model!r}. Made by gpadjust; numbers are in the units of the data."
     yield f"x: {', '.join(model.data.input_names)}."
+    place = ""
+    if is_within:
+        place = ", which is in this file"
     yield f"f_p: {num_physics} values that the physics returns at x{place}."
     if model.physics_parameters:
         means = model.physics_parameters.mean.tolist()
@@ -221,7 +238,7 @@ def _about(model: GP, num_physics: int, is_within: bool, spec: Any, noise: bool)
     if spec is not None and spec.step is not None:
         yield f"A step lasts {spec.step!r}."
     yield f"mean: {', '.join(model.data.output_names)}."
-    with_noise = "with" * noise or "without"
+    with_noise = "with" if noise else "without"
     yield f"variance: in their square, {with_noise} the noise; NULL if it is not wanted."
 
 
@@ -240,8 +257,12 @@ def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
     """Yield the parts of the sum at one point."""
     yield f"    const double z[INPUTS] = {braced(map(_input, s.columns))};\n"
     has_prior = variance and s.is_remainder
-    spread = ", spread[DRAWS * OUTPUTS]" * variance
-    yield _BEGIN.substitute(spread=spread, prior=", prior = 0.0" * has_prior)
+    spread = prior = ""
+    if variance:
+        spread = ", spread[DRAWS * OUTPUTS]"
+    if has_prior:
+        prior = ", prior = 0.0"
+    yield _BEGIN.substitute(spread=spread, prior=prior)
     first = 0  # feature of a term of waves
     for t, term in enumerate(s.terms):
         basis = "1.0"
@@ -326,8 +347,12 @@ def _step(
         yield f"    const double columns[{num_physics}] = {braced(columns)};"
         values.append("columns")
     has_variance = "double *variance" in arguments
-    yield f"    double learnt[{m}]{f', spread[{m}]' * has_variance};"
-    values += ["learnt"] + ["variance ? spread : 0"] * has_variance
+    results = [f"learnt[{m}]"]
+    values.append("learnt")
+    if has_variance:
+        results.append(f"spread[{m}]")
+        values.append("variance ? spread : 0")
+    yield f"    double {', '.join(results)};"
     yield f"    {name}_predict({', '.join(values)});"
     following = next_state(dynamics, state, action, entries("learnt", m))
     # All of them are there before `mean` is written, which may be `state`.

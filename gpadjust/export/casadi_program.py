@@ -172,7 +172,8 @@ def _features(s: FiniteSum, g: int, j: int, z: Any, f_p: list[Any]) -> tuple[Any
             angle = _matrix(term.frequencies * term.rate[g]) @ z.T
             size = basis * math.sqrt(amplitude / len(term.frequencies))
             waves += [size * ca.cos(angle), size * ca.sin(angle)]
-            waves += [basis * math.sqrt(constant)] * term.has_constant
+            if term.has_constant:
+                waves.append(basis * math.sqrt(constant))
         elif term.kind:
             # b(x) b(x_i) (a k(x, x_i) + c)
             points = s.points[j % len(s.points)]

@@ -113,12 +113,14 @@ def finite_sum(model: GP, variance: bool, observation_noise: bool) -> FiniteSum:
     if not is_remainder:
         lower, weights = _of_waves(conditioning)
     size = weights.shape[-1]
+    if not observation_noise:
+        noise = torch.zeros_like(noise)
     return FiniteSum(
         columns=_columns(model.data.transform, len(model.data.input_names)),
         num_physics=len(model.physics) * model.num_outputs,
         terms=terms,
         scale=model.unit.squeeze(-1).expand(shape).reshape(-1),
-        noise=noise.squeeze(-1).expand(shape).reshape(-1) * observation_noise,
+        noise=noise.squeeze(-1).expand(shape).reshape(-1),
         points=conditioning.train.x[0],
         weights=weights.reshape(-1, size),
         lower=lower.reshape(-1, size, size) if variance else None,
@@ -247,8 +249,10 @@ def _of_waves(conditioning: Conditioning) -> tuple[Tensor, Tensor]:
 def _columns(transform: Any, num_inputs: int) -> list[Column]:
     """Return the inputs of the kernels, by the transform of raw ones."""
     columns = [Column(i) for i in range(num_inputs)]
-    parts = [transform] * (transform is not None)
-    if isinstance(transform, ChainedInputTransform):
+    parts = [transform]
+    if transform is None:
+        parts = []
+    elif isinstance(transform, ChainedInputTransform):
         parts = [*transform.values()]
     for part in parts:
         is_plain = [column[1:] == Column(0)[1:] for column in columns]

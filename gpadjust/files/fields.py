@@ -144,7 +144,9 @@ def _moment(text: str, day_first: bool) -> tuple[str, timedelta] | None:
     if hour is not None:
         hours = int(hour)
         if half:  # 12 am is hour 0, 12 pm is hour 12
-            hours = hours % 12 + 12 * (half.lower() == "pm")
+            hours %= 12
+            if half.lower() == "pm":
+                hours += 12
         seconds = float((clock_second or "0").replace(",", "."))
         clock = timedelta(hours=hours, minutes=int(minute), seconds=seconds)
     if year is None and clock_second is None:
@@ -184,4 +186,6 @@ def seconds_in(unit: str) -> float | None:
 def time_unit_of(name: str) -> str:
     """Return the unit of time at the end of a name, as in ``time_ms`` or ``millis``, or ""."""
     last = re.split(r"[\s_.-]+", name.strip())[-1]
-    return last * (seconds_in(last) is not None)
+    if seconds_in(last) is None:
+        return ""
+    return last

@@ -33,14 +33,16 @@ def rows_of_text(file: str | Path, delimiter: str | None) -> tuple[list[Row], st
         text = content.decode("cp1252", errors="replace")
     first, _, rest = text.partition("\n")
     is_for_excel = first.strip().lower().startswith("sep=") and len(first.strip()) == 5
+    lines_above = 0
     if is_for_excel:
         delimiter = delimiter or first.strip()[4]
+        lines_above = 1
         text = rest
     mark = delimiter or _delimiter(text)
     try:
         if "\0" in text:  # newer versions of Python read it as text
             raise csv.Error("line contains NUL")
-        rows = [(line + is_for_excel, fields) for line, fields in _parsed(text, mark)]
+        rows = [(lines_above + line, fields) for line, fields in _parsed(text, mark)]
     except csv.Error as error:
         raise ValueError(
             f"{file}: expected a CSV file in UTF-8, but {error}; save it as UTF-8, in a "
@@ -55,8 +57,9 @@ def numeric_columns(rows: Sequence[Sequence[str]]) -> set[int]:
     balance: Counter[int] = Counter()
     for fields in body:
         for i, field in enumerate(fields):
-            if not is_missing(field):
-                balance[i] += 2 * is_value(field) - 1
+            if is_missing(field):
+                continue
+            balance[i] += 1 if is_value(field) else -1
     return {i for i, count in balance.items() if count >= 0}
 
 
@@ -89,13 +92,20 @@ def _delimiter(text: str) -> str:
         width, count = Counter(map(len, rows)).most_common(1)[0]
         if width < 2:
             continue
-        # A word counts half, and nothing if a sure delimiter would split it.
-        weights = [max(is_value(f), 0.5 * (not {*f} & {*_SURE})) for f in fields]
         # score = mean weight of a field times the share of rows with the most common width
-        score = sum(weights) / len(fields) * count / len(rows)
+        score = sum(map(_weight, fields)) / len(fields) * count / len(rows)
         if score > 1.001 * best_score:  # rounding must not decide between equal marks
             best_mark, best_score = mark, score
     return best_mark
+
+
+def _weight(field: str) -> float:
+    """Return 1 of a value; of a word a half, and 0 if a sure delimiter would split it."""
+    if is_value(field):
+        return 1.0
+    if {*field} & {*_SURE}:
+        return 0.0
+    return 0.5
 
 
 def rows_of_sheet(

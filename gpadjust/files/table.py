@@ -15,6 +15,7 @@ from torch import Tensor
 from gpadjust.files import fields as read
 from gpadjust.files.rows import is_value, numeric_columns, rows_of_sheet, rows_of_text
 from gpadjust.physics.formula import symbol
+from gpadjust.words import plural
 
 LARGEST = 1e100
 """The largest number that is accepted; squares of larger ones may overflow."""
@@ -164,7 +165,9 @@ class Table:
             ValueError: If a field is not a finite number, or one beyond 1e100.
         """
         column = self._column(name)
-        expected = "a number" + ", or nothing if it was not measured" * may_miss
+        expected = "a number"
+        if may_miss:
+            expected += ", or nothing if it was not measured"
         values = []
         for line, fields in self._rows:
             value = self._number(fields[column])
@@ -274,10 +277,9 @@ class Table:
             if not any(fields[width:]):  # a delimiter at the end of a line
                 row = fields[:width]
             if len(row) != width:
-                fields_s = "field" + "s" * (width != 1)
                 raise ValueError(
-                    f"{self.file}, line {line}: expected {width} {fields_s}, one for each name, "
-                    f"found {len(row)}; correct the line, or leave it out."
+                    f"{self.file}, line {line}: expected {plural(width, 'field')}, one for each "
+                    f"name, found {len(row)}; correct the line, or leave it out."
                     f"{self._miscounted(headers, row)}"
                 )
             self._rows[i] = line, row

@@ -148,7 +148,9 @@ class AtLevels(Kernel):
         one = x.new_ones(num_outputs, 1)
         rows = self.kernel.rows(torch.cat([self.low_x, x]), num_outputs)
         rows += [Row.positive("constant", DELTA_CONSTANT.median * one, DELTA_CONSTANT.factor)]
-        return rows + [Row("rho", one, 3.0)] * self.has_rho
+        if self.has_rho:
+            rows.append(Row("rho", one, 3.0))
+        return rows
 
     def basis(self, own: Values, x: Tensor) -> Tensor:
         """Return b, ``... x S x m x n``."""

@@ -140,7 +140,9 @@ class Physics(torch.nn.Module, ABC):
         is_floating = torch.is_tensor(X) and X.is_floating_point()
         d = X.shape[-1] if is_floating and X.dim() > 1 else 0
         if d == 0 or any(not -d <= i < d for i in self.inputs or ()):
-            columns = f", with the columns inputs={self.inputs}" * (self.inputs is not None)
+            columns = ""
+            if self.inputs is not None:
+                columns = f", with the columns inputs={self.inputs}"
             raise (ValueError if is_floating else TypeError)(
                 f"Physics {self.name!r} takes a floating-point tensor X of shape batch_shape x n x "
                 f"d{columns}; found {outline(X)}. Convert with torch.as_tensor(X, dtype="

@@ -59,8 +59,10 @@ class PhysicsWarning(UserWarning):
 def described(error: Exception) -> str:
     """Return the type and message of an error, and the end of a subprocess's stderr."""
     written = str(getattr(error, "stderr", None) or "").strip()
-    tail = f"; it wrote: {written[-_LONGEST:]}" * bool(written)
-    return f"{type(error).__name__}: {str(error).rstrip('.')}{tail}"
+    message = f"{type(error).__name__}: {str(error).rstrip('.')}"
+    if written:
+        message += f"; it wrote: {written[-_LONGEST:]}"
+    return message
 
 
 def outline(value: Any) -> str:

@@ -91,8 +91,8 @@ class Unknown:
         low, high = _pair("bounds", self.bounds)
         object.__setattr__(self, "bounds", (low, high))
         # sd, factor or two finite bounds: one of them is the prior.
-        spreads = (self.sd is not None) + (self.factor is not None)
-        is_one_prior = spreads == 1 or (spreads == 0 and math.isfinite(high - low))
+        lacking = (self.sd, self.factor).count(None)
+        is_one_prior = lacking == 1 or (lacking == 2 and math.isfinite(high - low))
         is_positive = self.factor is None or self.guess > 0
         if not (low < self.guess < high and is_positive and is_one_prior):
             raise ValueError(
@@ -143,7 +143,9 @@ class Unknown:
             text = f"{self.guess:g}, factor {self.factor:g}"
         else:
             return limits
-        return text + f", {limits}" * (self.bounds != _UNBOUNDED)
+        if self.bounds == _UNBOUNDED:
+            return text
+        return f"{text}, {limits}"
 
     def value(self, z: Tensor) -> Tensor:
         """Return the value at a coordinate, which is standard normal by the prior."""

@@ -278,7 +278,9 @@ def _program(
     """Return Python code of the same identification, which follows further actions."""
     states = [*spec.states]
     actions = [*spec.actions]
-    angles = f", angles={[*spec.angles]!r}" * bool(spec.angles)
+    names = f"{states!r}, {actions!r}"
+    if spec.angles:
+        names += f", angles={[*spec.angles]!r}"
     columns = "".join(f"    {name}={v!r},\n" for name, v in reading.items() if v is not None)
     further = "".join(f", {name}={v!r}" for name, v in options.items() if v is not None)
     return f"""\
@@ -286,7 +288,7 @@ def _program(
 from gpadjust.records import Records, identify
 from gpadjust.states import StateSpec
 
-spec = StateSpec({states!r}, {actions!r}{angles})
+spec = StateSpec({names})
 records = Records.read_csv(
     {[*files]!r},
     spec,

@@ -19,15 +19,15 @@ from gpadjust.validation.plots import (
     GREY,
     RED,
     band,
-    column,
     labels,
     legend,
     lines_along,
     mean_and_ends,
     tidy,
 )
-from gpadjust.validation.trust import SIDES, physics_at
-from gpadjust.words import bare, labelled, name_and_unit, number, percent, with_unit
+from gpadjust.validation.trust import SIDES
+from gpadjust.validation.verdict import has_one_sign
+from gpadjust.words import bare, labelled, name_and_unit, noted, number, percent, with_unit
 
 _CORRELATED = 0.7  # absolute correlation of parameters whose pair is drawn
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
@@ -48,11 +48,14 @@ def where_wrong(subject: Subject) -> Markup:
     if len(subject.inputs) > 1:
         values = zip(subject.inputs, point(subject, subject.base, 3), strict=True)
         pairs = [f"{bare(name)} = {with_unit(value, name)}" for name, value in values]
-        few = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
         others = f"Along each input the others stay at the median of the data: {', '.join(pairs)}"
-        parts.append(tag("p", f"{others}{few * (len(inputs) < len(pairs))}.", class_="note"))
+        if len(inputs) < len(pairs):
+            few = f"drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most"
+            others = noted(others, few)
+        parts.append(tag("p", f"{others}.", class_="note"))
     for j, name in enumerate(subject.outputs):
-        parts += [tag("h3", name)] * (len(subject.outputs) > 1)  # the title has a single one
+        if len(subject.outputs) > 1:  # the title has a single one
+            parts.append(tag("h3", name))
         parts += [tag("p", " ".join(_words(subject, j))), corrections(subject, j, inputs)]
     return html.join(parts)
 
@@ -104,8 +107,8 @@ def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
 @drawn
 def agreement(subject: Subject, output: int) -> list[Markup]:
     """Return observations over left-out predictions, by the formula and corrected."""
-    formulas = subject.physics_at(subject.X, output)
-    first = dict(zip(["your formula"], formulas.values(), strict=False))  # one or none
+    formulas = [*subject.physics_at(subject.X, output).values()]
+    first = {"your formula": formulas[0]} if formulas else {}
     figure = html.new_figure(3.2)
     y = subject.loo.judged[:, output]
     legend(plots.draw_left_out(figure.subplots(), subject.loo, y, output, first))
@@ -120,16 +123,16 @@ def corrections(subject: Subject, output: int, inputs: list[int]) -> list[Markup
     It is what the prediction adds to the physics, in per cent of it, or in the output's unit where
     the physics changes sign. Without a single physics it is the prediction itself.
     """
-    shown = subject.adjusted[output]
     name = subject.outputs[output]
     y = subject.loo.judged[:, output]
     at_data = [*subject.physics_at(subject.X, output).values()]
-    is_correction = shown is not None and len(at_data) == 1
-    is_share = is_correction and bool((at_data[0] > 0).all() or (at_data[0] < 0).all())
-    unit = name_and_unit(name)[1] * is_correction  # otherwise the label has it
+    is_correction = len(at_data) == 1
+    is_share = is_correction and has_one_sign(at_data[0])
     label = labels(subject.outputs)[output]
+    unit = ""  # the label has it
     if is_correction:
         label = "correction"
+        unit = name_and_unit(name)[1]
     if is_share:
         unit = "%"
 
@@ -141,21 +144,22 @@ def corrections(subject: Subject, output: int, inputs: list[int]) -> list[Markup
     lines = lines_along(subject.model, output, base=subject.base)
     for i in inputs:
         x, X = lines[i]
-        f, f_at_data = torch.zeros_like(x), torch.zeros_like(y)
         figure = html.new_figure(2.4)
         ax = figure.subplots()
-        if is_correction:
-            assert shown is not None
-            (values,) = physics_at(shown.model, X).values()
-            f, f_at_data = column(values, output), at_data[0]
-            ax.axhline(0, color=GREY, ls="--", lw=1.2)
         # The prediction less the formula along the line, and the data less the formula at them.
         ends = mean_and_ends(subject.model.marginals(X), output, 0.95)
-        curve, *band_ends = (relative(values, f) for values in ends)
-        band(ax, x, [curve, *band_ends], 0.95)
-        dots = relative(y, f_at_data)
+        dots = y
+        if is_correction:
+            (f,) = subject.physics_at(X, output).values()
+            ends = tuple(relative(values, f) for values in ends)
+            dots = relative(y, at_data[0])
+            ax.axhline(0, color=GREY, ls="--", lw=1.2)
+        band(ax, x, ends, 0.95)
         ax.plot(subject.X[:, i], dots, color=RED, **DOTS | {"ms": 3})
-        ax.set_ylim(*_limits(torch.cat([curve, dots[~dots.isnan()], 0 * x[:is_correction]])))
+        visible = [ends[0], dots[~dots.isnan()]]
+        if is_correction:
+            visible.append(x.new_zeros(1))  # the dashed line
+        ax.set_ylim(*_limits(torch.cat(visible)))
         room = 0.03 * float(x[-1] - x[0])  # for complete dots at the ends
         ax.set(xlim=(float(x[0]) - room, float(x[-1]) + room), xlabel=labels(subject.inputs)[i])
         ax.set_ylabel(labelled(label, unit))

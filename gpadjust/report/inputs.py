@@ -36,7 +36,7 @@ from gpadjust.physics import (
 )
 from gpadjust.physics.formula import has_pi, names_in, parse, symbol
 from gpadjust.physics.function import array_physics
-from gpadjust.words import bare, labelled, listed, plural
+from gpadjust.words import bare, labelled, listed, noun_for, plural, shortened
 
 _HINT = (
     "Name columns as the file does; a unit in brackets may be left out, so that 'head' is 'head "
@@ -154,24 +154,11 @@ def read_table(
             values.append(numbers)
         else:
             values.append(table.numbers(column, may_miss=not is_input))
-    # Leave out rows without any output, and all but some of very many.
     matrix = torch.stack(values, -1)
-    lines = torch.tensor(table.lines)
-    has_output = ~matrix[:, d:].isnan().all(-1)
-    rows = has_output.nonzero().flatten()
-    if dropped := [str(line) for line in lines[~has_output].tolist()]:
-        shown = [*dropped[:10], *[f"{len(dropped) - 10} more"] * (len(dropped) > 10)]
-        lines_s = "line" + "s" * (len(dropped) > 1)
-        remarks.append(f"Left out, as they have no output: {lines_s} {listed(shown)}.")
-    if (n := len(rows)) > arguments.rows:
-        # Drawn at random, as the first rows may be of one place or time; in the order of the file.
-        order = torch.randperm(n, generator=torch.Generator().manual_seed(arguments.seed))
-        rows = rows[order[: arguments.rows].sort().values]
-        remarks.append(
-            f"Of {plural(n, 'row')} {arguments.rows:,} were taken, drawn at random by --seed: a "
-            "comparison takes time with the cube of their number. --rows takes more or fewer."
-        )
+    rows, of_rows = _rows_taken(table, matrix[:, d:], arguments)
+    remarks += of_rows
     X, Y = matrix[rows].split([d, len(outputs)], -1)
+    # Each output has observations to be judged by.
     for name, count in zip(names[d:], (~Y.isnan()).sum(0).tolist(), strict=True):
         if count < 2:
             raise ValueError(
@@ -188,7 +175,28 @@ def read_table(
             numbered = listed(f"{k} is {level}" for k, level in enumerate(of_column))
             remarks.append(f"The physics reads {bare(name)} as a number: {numbered}.")
     X_and_Y = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
-    return TableData(*X_and_Y, lines[rows].tolist(), tuple(remarks), levels)
+    lines = [table.lines[row] for row in rows.tolist()]
+    return TableData(*X_and_Y, lines, tuple(remarks), levels)
+
+
+def _rows_taken(table: Table, Y: Tensor, arguments: Namespace) -> tuple[Tensor, list[str]]:
+    """Return the rows with an output, of very many some, and remarks on the others."""
+    remarks = []
+    has_output = ~Y.isnan().all(-1)
+    rows = has_output.nonzero().flatten()
+    dropped = [str(table.lines[row]) for row in (~has_output).nonzero().flatten().tolist()]
+    if dropped:
+        lines = f"{noun_for(len(dropped), 'line')} {listed(shortened(dropped, 10))}"
+        remarks.append(f"Left out, as they have no output: {lines}.")
+    if (n := len(rows)) > arguments.rows:
+        # Drawn at random, as the first rows may be of one place or time; in the order of the file.
+        order = torch.randperm(n, generator=torch.Generator().manual_seed(arguments.seed))
+        rows = rows[order[: arguments.rows].sort().values]
+        remarks.append(
+            f"Of {plural(n, 'row')} {arguments.rows:,} were taken, drawn at random by --seed: a "
+            "comparison takes time with the cube of their number. --rows takes more or fewer."
+        )
+    return rows, remarks
 
 
 def _are_names(table: Table, name: str) -> bool:
@@ -248,9 +256,11 @@ class GivenPhysics(NamedTuple):
 def imports_of(code: str, modules: Sequence[str], *names: str) -> str:
     """Return lines that import what the code of a physics needs, and names of the library."""
     names = (*(name for name in _MADE if f"{name}(" in code), *names)
-    lines = ["from math import inf\n"] * bool(re.search(r"\binf\b", code))
-    lines += ["import torch", *(f"import {module}" for module in modules)]
-    lines += [f"from gpadjust import {', '.join(names)}"] * bool(names)
+    lines = ["import torch", *(f"import {module}" for module in modules)]
+    if re.search(r"\binf\b", code):
+        lines.insert(0, "from math import inf\n")
+    if names:
+        lines.append(f"from gpadjust import {', '.join(names)}")
     return "\n".join(lines)
 
 
@@ -325,7 +335,7 @@ def columns_of(
     absent = sorted(used - {*symbols, *unknowns})
     if not absent and (columns or inputs):
         return columns
-    wrong = (absent or ["none of them"])[0]
+    wrong = absent[0] if absent else "none of them"
     hint = meant(wrong, [*symbols, *unknowns])
     if _CELL.fullmatch(wrong):
         hint = f" {wrong} seems to be a cell: write the name of its column."
@@ -357,25 +367,41 @@ def given_physics(
     formulas = [text for text in texts if ":" not in text]
     parts, code = dict[str, Physics](), dict[str, str]()
     for text in texts:
-        short = text.rpartition(":")[2].rpartition(".")[2]
-        if text in formulas:  # figures have room for a short name
-            short = "formula" + f" {formulas.index(text) + 1}" * (len(formulas) > 1)
+        short = _short_name(text, formulas)
         name = text if short in parts else short
-        make = _formula if text in formulas else _function
         try:  # before the fit, which may take minutes
-            parts[name], code[name] = make(text, data, unknowns)
+            if text in formulas:
+                parts[name], code[name] = _formula(text, data, unknowns)
+            else:
+                parts[name], code[name] = _function(text, data)
             _check(parts[name], data)
         except ValueError as error:
             raise ValueError(f"--physics {text}: {error}") from error
     used = {name for physics in parts.values() for name in physics.unknowns}
     if absent := [name for name in unknowns if name not in used]:
-        way = " A function has its own: FunctionPhysics(f, unknowns=...)." * (not formulas)
-        raise ValueError(f"--unknown names {absent[0]!r}, which is in no formula.{way}")
-    modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
+        message = f"--unknown names {absent[0]!r}, which is in no formula."
+        if not formulas:
+            message += " A function has its own: FunctionPhysics(f, unknowns=...)."
+        raise ValueError(message)
+    # A single physics is itself, several are a dictionary.
+    physics: Any = parts
+    program = f"{{{', '.join(f'{name!r}: {text}' for name, text in code.items())}}}"
     if len(parts) == 1:
-        return GivenPhysics(parts[name], code[name] * bool(modules), modules)
-    several = ", ".join(f"{name!r}: {text}" for name, text in code.items())
-    return GivenPhysics(parts, f"{{{several}}}" * bool(modules), modules)
+        (physics,) = parts.values()
+        (program,) = code.values()
+    modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
+    if not modules:  # a model's file holds formulas
+        program = ""
+    return GivenPhysics(physics, program, modules)
+
+
+def _short_name(text: str, formulas: Sequence[str]) -> str:
+    """Return a name for which figures have room."""
+    if text not in formulas:
+        return text.rpartition(":")[2].rpartition(".")[2]
+    if len(formulas) == 1:
+        return "formula"
+    return f"formula {formulas.index(text) + 1}"
 
 
 def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tuple[Physics, str]:
@@ -385,19 +411,23 @@ def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tup
         physics = FormulaPhysics(text, data.X.columns, unknowns=used)
     except ValueError as error:
         raise ValueError(f"{error} {_HOW}") from error
-    more = f", unknowns={used!r}" * bool(used)
-    return physics, f"FormulaPhysics({text!r}, {[*physics.columns]!r}{more})"
+    arguments = f"{text!r}, {[*physics.columns]!r}"
+    if used:
+        arguments += f", unknowns={used!r}"
+    return physics, f"FormulaPhysics({arguments})"
 
 
-def _function(path: str, data: TableData, _: object = None) -> tuple[Physics, str]:
+def _function(path: str, data: TableData) -> tuple[Physics, str]:
     """Return the physics that a path names, and its code."""
     function = imported(path)
     code = path.replace(":", ".")
     try:
         physics = array_physics(function, data.X.to_numpy())
-    except (TypeError, PhysicsError) as error:
-        row = f" The first row is line {data.lines[0]} of the file."
-        raise ValueError(f"{error}{row * isinstance(error, PhysicsError)}") from error
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    except PhysicsError as error:
+        row = f"The first row is line {data.lines[0]} of the file."
+        raise ValueError(f"{error} {row}") from error
     is_numpy = isinstance(physics, BlackBoxPhysics) and physics is not function
     return physics, f"BlackBoxPhysics({code})" if is_numpy else code
 
@@ -422,7 +452,8 @@ def motion(
         except (ValueError, TypeError) as error:
             raise ValueError(f"--physics {path}: {error}") from error
         return GivenPhysics(physics, path.replace(":", "."), (path.partition(":")[0],))
-    sides, primes = dict[str, str](), set[str]()  # right sides by state; "'" and ""
+    # Read the right side of each state, and whether it is a derivative: a prime, or nothing.
+    sides, primes = dict[str, str](), set[str]()
     for text in texts:
         match = _EQUATION.fullmatch(text)
         trees = [] if match is None else parse(match[3])
@@ -439,7 +470,8 @@ def motion(
             f"Expected an equation for each of {', '.join(states)}, all of time derivatives or all "
             f"of next values, found equations for {', '.join(sides)}."
         )
-    formula = ", ".join(sides[name] for name in states)  # outputs have commas between them
+    # One formula has all states as its outputs, with commas between them.
+    formula = ", ".join(sides[name] for name in states)
     columns = [*states, *actions]
     check_names(unknowns, "--unknown", names_in(formula), "the names in equations")
     physics = FormulaPhysics(formula, columns, unknowns=unknowns)
@@ -462,8 +494,9 @@ def imported(path: str) -> Any:
         return attrgetter(name)(import_module(module))
     except (Exception, SystemExit) as error:  # importing runs the user's code
         last = traceback.extract_tb(error.__traceback__)[-1]
-        is_ours = "importlib" in last.filename or last.filename == __file__
-        place = f" ({Path(last.filename).name}, line {last.lineno})" * (not is_ours)
+        place = f" ({Path(last.filename).name}, line {last.lineno})"
+        if "importlib" in last.filename or last.filename == __file__:  # not the user's code
+            place = ""
         near = meant(module, files)
         if module in files:
             near = meant(name, vars(sys.modules.get(module, object)))
@@ -481,12 +514,13 @@ def _check(physics: Physics, data: TableData) -> None:
     Y = _values(physics, data)
     again = _values(physics, data)  # a random physics cannot be judged
     if Y.shape[-1] != m:
-        hint = " Commas part the outputs of a formula: is one a decimal comma?"
-        raise ValueError(
+        message = (
             f"expected {plural(m, 'column')}, one for each of --outputs "
             f"{', '.join(data.Y.columns)}, found {Y.shape[-1]}."
-            f"{hint * isinstance(physics, FormulaPhysics)}"
         )
+        if isinstance(physics, FormulaPhysics):
+            message += " Commas part the outputs of a formula: is one a decimal comma?"
+        raise ValueError(message)
     is_same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
     exclude = "Correct the physics there, or exclude such inputs:"
     settle = "Take random numbers out of it, or let it set their seed itself:"
@@ -609,4 +643,4 @@ def variances_of(
 def meant(name: str, others: Iterable[str]) -> str:
     """Return a hint at the name that was meant, if some is near."""
     near = get_close_matches(name, [*others], n=1)
-    return "".join(f" Is it {match!r}?" for match in near)
+    return f" Is it {near[0]!r}?" if near else ""

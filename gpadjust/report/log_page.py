@@ -45,6 +45,11 @@ _LACK = (
     "bars are their means in bins, with intervals of 95 %. Parameters are fitted together with "
     "such a term."
 )
+_IN_PYTHON = (
+    "The command has no option for a fit to free runs: add `by_free_runs=True` to identify in the "
+    "program below, in Python."
+)
+_COLORS = {"Yes": "yes", "No": "no"}  # other answers are open
 _HEIGHT = 2.6  # inches of a figure
 _WINDOWS = 3  # that are drawn
 _DIVERGING = 1e30  # an error in any unit, or more
@@ -61,11 +66,13 @@ def page(machine: Identification, title: str | None, origin: Origin) -> Page:
     step, held_out = (f"{time} {units.get('time', '')}".strip() for time in times)
     steps = sum(len(record.times) - 1 for record in machine.smoothed.records)
     # Steps that are fitted, and held out.
-    hidden = f", {listed(machine.hidden)} hidden" * bool(machine.hidden)
+    steps_held_out = len(measured) * round(seconds / control_step)
+    states = listed(spec.states)
+    if machine.hidden:
+        states += f", {listed(machine.hidden)} hidden"
     lead = (
-        f"{listed(spec.states)}{hidden}, under {listed(spec.actions)}: fitted to "
-        f"{plural(steps, 'step')} of {step}, "
-        f"{plural(len(measured) * round(seconds / control_step), 'step')} held out."
+        f"{states}, under {listed(spec.actions)}: fitted to {plural(steps, 'step')} of {step}, "
+        f"{plural(steps_held_out, 'step')} held out."
     )
     cards, rows = _judged(machine, units, held_out)
     head = ["by", "state", "error (root mean square)", "unit", "95 % intervals cover"]
@@ -75,14 +82,19 @@ def page(machine: Identification, title: str | None, origin: Origin) -> Page:
         caption = "Parameters by the fitted part of the log"
         parameters = [html.parameter_table(caption, machine.parameters), tag("p", _PARAMETERS)]
         parameters.append(_combinations(machine))
-    lack = [tag("p", f"{machine.lack} {_LACK}")] * (machine.lack is not None)
+    lack = [_residual(machine, units)]
+    if machine.lack is not None:
+        lack.insert(0, tag("p", f"{machine.lack} {_LACK}"))
+    advice = [*machine.advice, *origin.notes]
+    if origin.program and any("by_free_runs" in sentence for sentence in advice):
+        advice.append(_IN_PYTHON)
     sections = {
         "Parameters of the physics": html.join(parameters),
         "Free run": html.join([*free_run, _runs(machine, units)]),
-        "What the equations lack": html.join([*lack, _residual(machine, units)]),
+        "What the equations lack": html.join(lack),
         "Noise": _noise(machine, units),
         "States": _states(machine, units),
-        "Advice": html.bullets([*machine.advice, *origin.notes]),
+        "Advice": html.bullets(advice),
         "Continue in Python": html.code(origin.program),
     }
     lines = []
@@ -110,7 +122,7 @@ def _judged(
         rmse = {by: float(machine.errors[by][i]) for by in _NAMES if by in machine.errors}
         answer, reasons = machine.verdicts[name]
         errors = {_NAMES[by]: _error(error, unit) for by, error in rmse.items()}
-        color = {"Yes": "yes", "No": "no"}.get(answer, "open")
+        color = _COLORS.get(answer, "open")
         cards.append(Card(name, errors, note, answer, reasons, color))
         shares = {IDENTIFIED: percent(machine.coverage[i])}
         for by, error in rmse.items():

@@ -16,7 +16,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from gpadjust.physics import PhysicsError, PhysicsParameters
-from gpadjust.words import listed, number
+from gpadjust.words import listed, number, shortened
 
 P = ParamSpec("P")
 _VOID = ("img", "meta")  # elements without an end
@@ -136,8 +136,9 @@ def side_by_side(cards: Sequence[Card]) -> Markup:
     """Return the answer on each output, its reasons, its errors in large numbers, its picture."""
     shown = []
     for card in cards:
-        parts = [tag("h3", card.name)] * (len(cards) > 1)
-        parts.append(tag("p", card.answer, class_="answer"))
+        parts = [tag("p", card.answer, class_="answer")]
+        if len(cards) > 1:
+            parts.insert(0, tag("h3", card.name))
         parts += [tag("p", reason.replace("+-", "±")) for reason in card.reasons]
         numbers = [tag("div", tag("dt", n), tag("dd", value)) for n, value in card.errors.items()]
         parts += [tag("dl", *numbers, class_="errors"), tag("p", card.note, class_="note")]
@@ -177,10 +178,8 @@ def failure(error: PhysicsError) -> str:
     message = str(error.args[0]).rstrip(": ")
     if error.inputs is None or not len(error.inputs):  # the call failed as a whole
         return message
-    rows = [f"({', '.join(map(number, row))})" for row in error.inputs[:_SHOWN].tolist()]
-    more = len(error.inputs) - len(rows)
-    rows += [f"{more} more"] * (more > 0)
-    return f"{message.rstrip('.')}: at inputs {listed(rows)}."
+    rows = [f"({', '.join(map(number, row))})" for row in error.inputs.tolist()]
+    return f"{message.rstrip('.')}: at inputs {listed(shortened(rows, _SHOWN))}."
 
 
 def drawn(draw: Callable[P, list[Markup]]) -> Callable[P, Markup]:

@@ -22,8 +22,8 @@ from gpadjust.report.markup import Card, Markup, Page, tag
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.validation import Comparison
 from gpadjust.validation.comparison import STACKED
-from gpadjust.validation.verdict import ALONE, AS_IS, CALIBRATED, CORRECTED, NOT
-from gpadjust.words import listed, number, plural, with_unit
+from gpadjust.validation.verdict import ALONE, AS_IS, CALIBRATED, CORRECTED, NOT, name_of
+from gpadjust.words import listed, name_among, noted, number, plural, with_unit
 
 _ERRORS = {ALONE: "your formula", CALIBRATED: "your formula, calibrated"}
 _COLORS = {AS_IS: "yes", CORRECTED: "yes", NOT: "no"}  # other answers are open
@@ -102,7 +102,10 @@ def checked_path(file: str | Path, *data: str | Path, model: bool = True) -> Pat
         raise ValueError(f"Expected a page such as 'report.html' to write to, got {str(file)!r}.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"There is no folder {str(path.parent)!r} to write {path.name} to.")
-    for target in (path, path.with_suffix(".pt"))[: 1 + model]:  # the page of a log has no model
+    targets = [path]
+    if model:  # the page of a log has none
+        targets.append(path.with_suffix(".pt"))
+    for target in targets:
         if target.is_dir():
             raise IsADirectoryError(
                 f"{str(target)!r} is a folder, expected a file; give the page another name."
@@ -175,7 +178,7 @@ def _page(
     sections = {name: make() for name, make in bar}
     names = ", ".join(f"{name} ({type(f).__name__})" for name, f in subject.physics.items())
     physics = names or "known through samples"
-    form = "prediction = rho(x) formula(x) + delta(x)"
+    form = formula_of(subject)
     question = "Should you use your formula?"
     if not subject.has_physics:
         physics = "none"
@@ -193,6 +196,14 @@ def _page(
         sections,
         {**origin.settings, "model": repr(subject.model), "physics": physics},
     )
+
+
+def formula_of(subject: Subject) -> str:
+    """Return the adjustment as a formula, on the scale of the link if the model has one."""
+    sides = ["prediction", "formula(x)"]
+    if subject.link is not None:
+        sides = [subject.link.formula.replace("y", side) for side in sides]
+    return f"{sides[0]} = rho(x) {sides[1]} + delta(x)"
 
 
 def cards(subject: Subject, how: str = Origin.how) -> list[Card]:
@@ -217,7 +228,7 @@ def headline(cards: list[Card], kind: str) -> str:
     for card in cards:
         numbers = "; ".join(f"{label}: {value}" for label, value in card.errors.items())
         answer = f" {card.answer}."
-        if len(cards) == 1:
+        if len(cards) == 1:  # with room for a reason
             answer = f"\n{card.answer}. {card.reasons[0]}"
         lines.append(f"{kind} of {card.name}, {numbers}.{answer}")
     return "\n".join(lines)
@@ -232,21 +243,18 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
         values = subject.physics_at(subject.X, output)
         rmse_by = {}
         for physics, f_p in values.items():
-            alone = ALONE + f" of {physics}" * (len(values) > 1)
+            alone = name_of(ALONE, name_among(physics.removeprefix("physics "), values))
             # the root mean square of y - f_p
             rmse_by[alone] = float((subject.loo.judged[:, output] - f_p).square().nanmean().sqrt())
         adjusted = "adjusted" if subject.has_physics else "data alone"
         rmse_by[adjusted] = float(subject.loo.score().rmse[output])
     shown = {}
-    for kind, rmse in rmse_by.items():
-        short, of, physics = kind.partition(" of ")
-        label = _ERRORS.get(
-            short, short
-        )  # "physics alone of coarse" has the name of one of several
-        if short == ALONE and any(part.unknowns for part in subject.physics.values()):
+    for structure, rmse in rmse_by.items():
+        kind, _, physics = structure.partition(" of ")  # the name of one of several
+        label = _ERRORS.get(kind, kind)
+        if kind == ALONE and any(part.unknowns for part in subject.physics.values()):
             label += ", with fitted parameters"
-        which = f" ({physics.removeprefix('physics ')})" * bool(of)
-        shown[f"{label}{which}"] = with_unit(number(rmse), name)
+        shown[noted(label, physics)] = with_unit(number(rmse), name)
     return shown
 
 
@@ -276,11 +284,10 @@ def recommendation(subject: Subject) -> Markup:
         return tag("p", f"This page is of a single model, {subject.model!r}, without a comparison.")
     if len(comparison.models) == 1:
         (name,) = comparison.models
-        return tag("p", f"Only {name} was fitted: {tables.described(name)}.")
+        return tag("p", f"Only {name} was fitted: {tables.described(name, subject.link)}.")
     name = comparison.chosen
-    if name != STACKED:
-        why = f", {tables.described(name)}. It has nearly all the weight."
-        return tag("p", "Recommended: ", tag("strong", name), why)
-    mixture = tag("strong", "the mixture of all structures")
-    why = ", with the weights of the table. Its intervals contain the doubt between them."
-    return tag("p", "Recommended: ", mixture, why)
+    why = f", {tables.described(name, subject.link)}. It has nearly all the weight."
+    if name == STACKED:
+        name = "the mixture of all structures"
+        why = ", with the weights of the table. Its intervals contain the doubt between them."
+    return tag("p", "Recommended: ", tag("strong", name), why)

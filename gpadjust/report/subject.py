@@ -11,6 +11,7 @@ from torch import Tensor
 from gpadjust.core import GP, StackedGP
 from gpadjust.kinds.ar1 import AR1
 from gpadjust.kinds.categories import Categories
+from gpadjust.kinds.links import Link
 from gpadjust.physics import Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
 from gpadjust.validation.plots import column
@@ -57,6 +58,13 @@ class Subject:
     base: Tensor  # medians of the inputs, d, for slices; of categories a level
     levels: dict[int, tuple[str, ...]]  # names of categories, by column; their numbers are from 0
     batches: list[int]  # columns of batches
+
+    @property
+    def link(self) -> Link | None:
+        """The link of the models, on whose scale they adjust the physics; None without one."""
+        models = getattr(self.model, "models", [self.model])
+        link: Link | None = getattr(models[0], "link", None)
+        return link
 
     def outliers(self, output: int) -> list[str]:
         """Return the names of the rows whose observation of an output counts as an outlier."""

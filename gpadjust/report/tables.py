@@ -12,6 +12,7 @@ from gpadjust.core import GP, CalibratedPhysics, KnownNoise, Noise, StackedGP
 from gpadjust.core.saving import Saved
 from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise
 from gpadjust.kinds.heavy_tails import RowNoise
+from gpadjust.kinds.links import Link
 from gpadjust.physics import PhysicsParameters
 from gpadjust.physics.import_path import is_formula
 from gpadjust.report import figures
@@ -21,7 +22,7 @@ from gpadjust.report.markup import Markup, join, table, tag
 from gpadjust.report.subject import Origin, Subject
 from gpadjust.validation.comparison import STACKED, cells_of, spread_of
 from gpadjust.validation.verdict import ALONE
-from gpadjust.words import bare, listed, name_and_unit, number, percent, plural, with_unit
+from gpadjust.words import bare, listed, name_and_unit, noted, number, percent, plural, with_unit
 
 _STRUCTURES = {
     "zero mean": "no physics: a Gaussian process of the data alone",
@@ -62,10 +63,13 @@ _WORST = 5  # observations in a table
 _LEVELS = (0.5, 0.8, 0.95)
 
 
-def described(structure: str) -> str:
-    """Return the description of a structure, with the physics if it is of one of several."""
-    short, of, physics = structure.partition(" of ")
-    return _STRUCTURES.get(short, "your own structure") + f" ({physics})" * bool(of)
+def described(structure: str, link: Link | None) -> str:
+    """Return the description of a structure, with its scale, and its physics if one of several."""
+    kind, _, physics = structure.partition(" of ")
+    text = _STRUCTURES.get(kind, "your own structure")
+    if link is not None and "delta(x)" in text:
+        text += f", on the scale of {link.formula}"
+    return noted(text, physics)
 
 
 def structures(subject: Subject) -> Markup:
@@ -90,7 +94,7 @@ def structures(subject: Subject) -> Markup:
             rows.append([row.structure, *first, weight, *errors, of_use])
             names[row.structure] = None  # in their order, each once
         parts.append(table(f"Left-out predictions of {output}, best first", head, rows, marked=0))
-    terms = [join([tag("dt", name), tag("dd", described(name))]) for name in names]
+    terms = [join([tag("dt", name), tag("dd", described(name, subject.link))]) for name in names]
     return join([*parts, tag("p", _ELPD), tag("dl", *terms)])
 
 
@@ -131,21 +135,28 @@ def _worst(subject: Subject, j: int) -> Markup:
     name = subject.outputs[j]
     outliers = subject.outliers(j)
     distance = loo.residuals[:, j].abs().nan_to_num(nan=-1.0)  # a missing one is the last
-    if loo.is_outlier is not None:
+    if loo.is_outlier is not None:  # an outlier is farther than all others
         distance = distance.masked_fill(loo.is_outlier[:, j], math.inf)
     order = [i for i in distance.argsort(descending=True).tolist() if distance[i] >= 0][:_WORST]
     has_room = len(subject.inputs) <= 4
     head = ["", with_unit("observed", name, "{} [{}]"), with_unit("predicted", name, "{} [{}]")]
+    head += ["95 %", "residual / sd"]
+    if has_room:
+        head += subject.inputs
     low, high = loo.interval()
     rows = []
     for i in order:
         interval = f"{number(low[i, j], 4)} to {number(high[i, j], 4)}"
         cells = [number(loo.Y[i, j], 4), number(loo.mean[i, j], 4), interval]
         cells.append(f"{loo.residuals[i, j]:+.1f}")
-        cells += figures.point(subject, subject.X[i]) * has_room
-        rows.append([subject.rows[i] + " (outlier)" * (subject.rows[i] in outliers), *cells])
+        if has_room:
+            cells += figures.point(subject, subject.X[i])
+        row = subject.rows[i]
+        if row in outliers:
+            row = noted(row, "outlier")
+        rows.append([row, *cells])
     caption = f"The {len(rows)} observations of {name} that are farthest from their predictions"
-    return table(caption, [*head, "95 %", "residual / sd", *subject.inputs * has_room], rows)
+    return table(caption, head, rows)
 
 
 def coverage(subject: Subject) -> Markup:
@@ -187,7 +198,9 @@ def parameters(subject: Subject) -> Markup:
             parts += [html.parameter_table(by, posterior), figures.densities(posterior)]
             if names := posterior.untold:
                 parts.append(tag("p", _UNKNOWN.format(structure, listed(names))))
-    return join([*parts, *[tag("p", _PARAMETERS)] * bool(parts)])
+    if parts:
+        parts.append(tag("p", _PARAMETERS))
+    return join(parts)
 
 
 def summary(subject: Subject) -> Markup:
@@ -211,7 +224,7 @@ def data(subject: Subject, remarks: tuple[str, ...]) -> Markup:
             rows.append([short, kind, unit or "-", *ends, str(len(column) - len(numbers))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
     first = f"{plural(len(subject.X), 'row')} of data. {_repeats(subject)}"
-    items = html.bullets([first, *remarks, _assumed(subject.model)])
+    items = html.bullets([first, *remarks, _assumed(subject)])
     return join([table("Columns", head, rows), items])
 
 
@@ -235,10 +248,10 @@ def _repeats(subject: Subject) -> str:
     return f"{same}, and their outputs differ by a standard deviation of {', '.join(spreads)}."
 
 
-def _assumed(model: GP | StackedGP) -> str:
+def _assumed(subject: Subject) -> str:
     """Return the assumptions of a model on its data, in a sentence."""
-    part: Any = getattr(model, "models", [model])[0]
-    inputs = part.data.input_names
+    part: Any = getattr(subject.model, "models", [subject.model])[0]
+    inputs = subject.inputs
     transform = part.data.transform
     noises = [part.noise]
     while isinstance(noises[-1], RowNoise):
@@ -249,16 +262,18 @@ def _assumed(model: GP | StackedGP) -> str:
             pairs = zip(inputs, noise.settings["variances"].mean(0).sqrt(), strict=True)
             sds = [f"{bare(n)} by {with_unit(number(s), n)}" for n, s in pairs if s > 0]
             words.append(f"inputs that are noisy themselves: {listed(sds)} (standard deviations)")
-    if (link := getattr(part, "link", None)) is not None:
-        outputs = listed(bare(name) for name in part.data.output_names)
-        below = f" and below {link.upper:g}" * math.isfinite(link.upper)
-        words.append(f"{outputs} above {link.lower:g}{below}")
+    if (link := subject.link) is not None:
+        bounds = f"{listed(map(bare, subject.outputs))} above {link.lower:g}"
+        if math.isfinite(link.upper):
+            bounds += f" and below {link.upper:g}"
+        words.append(bounds)
     if isinstance(transform, Categories):
         batches = [inputs[i] for i in transform.batches]
         plain = [inputs[i] for i in transform.levels if i not in transform.batches]
-        words += [f"categories in {listed(plain)}"] * bool(plain)
-        offsets = f"offsets of {listed(batches)}, whatever the other inputs are"
-        words += [offsets] * bool(batches)
+        if plain:
+            words.append(f"categories in {listed(plain)}")
+        if batches:
+            words.append(f"offsets of {listed(batches)}, whatever the other inputs are")
     default = "noise of one size, exact inputs, numbers that may be of any size"
     return f"Assumed: {'; '.join(words or [default])}."
 
@@ -273,8 +288,7 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     arguments = [repr(file)]
     # The file may hold the physics, or its name, or neither.
     if origin.physics:
-        where = f"module{'s' * (len(origin.modules) > 1)} {listed(origin.modules)}"
-        words.append(f"Python has to find the {where}: there, or in a folder on PYTHONPATH.")
+        words.append(f"Python imports {listed(origin.modules)} from there, or from PYTHONPATH.")
         arguments.append(f"physics={origin.physics}")
         missing = [name for name in missing if name != "physics"]
     elif "physics" in missing:
@@ -296,7 +310,8 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     ]
     for i, names in subject.levels.items():
         levels = [f"{k} is {name}" for k, name in enumerate(names)]
-        levels += ["any other number is a new one"] * (i in subject.batches)
+        if i in subject.batches:
+            levels.append("any other number is a new one")
         lines.append(f"# {subject.inputs[i]}: {', '.join(levels)}")
     point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())  # in the middle of the data
     lines += [

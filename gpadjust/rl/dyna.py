@@ -247,7 +247,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         recorded = self.recorded_episodes()
         new = recorded.subset(slice(buffer.num_learnt, None))
         data = new if dynamics.has_learnt else recorded
-        is_enough = len(new) and len(data) >= 2 - dynamics.is_fitted  # two rows have a scale
+        is_enough = len(new) and (len(data) > 1 or dynamics.is_fitted)  # two rows have a scale
         if is_enough and uses_model and options.reward_tolerance is not None:
             check_functions(self.task, data, options.reward_tolerance)
         # Update on real transitions, and on transitions of earlier models.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gpadjust.core import GP
 from gpadjust.core.summary import numbers_of
+from gpadjust.words import about, name_among
 
 
 @torch.no_grad()
@@ -114,6 +115,6 @@ def _numbers(model: GP, u: Tensor) -> dict[str, Tensor]:
     """Return the numbers by name; of several outputs names begin with the output."""
     draws = {}
     for (output, name), number in numbers_of(model, u).items():
-        prefix = f"{output}: " * bool(output and model.num_outputs > 1)
-        draws[prefix + name] = number.draws.expand(len(u))
+        subject = name_among(output, model.data.output_names)
+        draws[about([subject], name)] = number.draws.expand(len(u))
     return draws

@@ -39,10 +39,11 @@ from gpadjust.validation.verdict import (
     Verdict,
     difference,
     formulas_of,
+    name_of,
     unsampled,
     verdict_of,
 )
-from gpadjust.words import number, percent
+from gpadjust.words import about, name_among, number, percent
 
 STACKED = "stacked"  # the name of the mixture of all structures in a comparison
 _ALL = 0.95  # weight of a structure that needs no others
@@ -157,12 +158,9 @@ class Comparison(Display):
 
     def __str__(self) -> str:
         lines: list[str] = []
-        outputs = {name: f"{name}: " * (len(self.table) > 1) for name in self.table}
         for output, errors in self.errors().items():
-            # The error of the physics alone is the same, left out or not.
-            how = {name: ", left out" * (not name.startswith(ALONE)) for name in errors}
-            texts = [f"{name}{how[name]}: RMSE {rmse:.3g}" for name, rmse in errors.items()]
-            lines.append(outputs[output] + "; ".join(texts))
+            texts = [f"{_left_out(name)}: RMSE {rmse:.3g}" for name, rmse in errors.items()]
+            lines.append(about([name_among(output, self.table)], "; ".join(texts)))
         lines.append("")
         width = max(len(row.structure) for rows in self.table.values() for row in rows)
         for output, rows in self.table.items():
@@ -172,7 +170,8 @@ class Comparison(Display):
                 lines.append(f"{name:{width}}" + "".join(f"  {text:>9}" for text in texts))
             lines.append("")
         for output, verdict in self.verdict.items():
-            lines.append(" ".join([f"{outputs[output]}{verdict.answer}.", *verdict.reasons]))
+            sentences = " ".join([f"{verdict.answer}.", *verdict.reasons])
+            lines.append(about([name_among(output, self.table)], sentences))
         return "\n".join([*lines, *self.advice])
 
     def _repr_html_(self) -> str:
@@ -187,6 +186,13 @@ class Comparison(Display):
                 rows.append([row.structure, *errors, *(cells[name] for name in head[3:])])
             tables.append(html_table(output + answers.get(output, ""), head, rows))
         return "".join(tables)
+
+
+def _left_out(name: str) -> str:
+    """Return the name of an error, and whether it is of left-out observations."""
+    if name.startswith(ALONE):  # it has the same error, left out or not
+        return name
+    return f"{name}, left out"
 
 
 def cells_of(row: Candidate) -> dict[str, str]:
@@ -298,8 +304,7 @@ def compare(
     is_outlier = getattr(left_out.get(_chosen(stacked)), "is_outlier", None)
     for name, part in parts.items():
         if not part.unknowns:  # with unknown parameters the physics alone is CalibratedPhysics
-            full_name = ALONE + f" of {name}" * bool(name)
-            left_out[full_name] = left_out_by_physics(part, data, is_outlier)
+            left_out[name_of(ALONE, name)] = left_out_by_physics(part, data, is_outlier)
 
     # Rank the structures for each output.
     kinds = {structure.name: structure.kind for structure, _ in candidates}
@@ -320,10 +325,10 @@ def compare(
         formulas = formulas_of(comparison, [*parts], j)
         faults = {name: fault_of(data, j, f) for name, f in formulas.items()}
         for name, fault in faults.items():
-            if fault:
-                names = [name] * bool(name) + [output] * (len(data.output_names) > 1)
-                messages[": ".join([*names, fault]), PhysicsWarning] = None
-        verdict = verdict_of(comparison, j, formulas.get(""), faults.get("", ""))
+            if fault is not None:
+                subjects = [name, name_among(output, data.output_names)]
+                messages[about(subjects, fault.text), PhysicsWarning] = None
+        verdict = verdict_of(comparison, j, formulas.get(""), faults.get(""))
         if verdict is not None:
             verdicts[output] = verdict
     for text, category in messages:
@@ -372,8 +377,9 @@ def _of_factory(factory: Any) -> Structure:
     name = getattr(function, "__name__", type(function).__name__)
     defaults = [structure for structure in STRUCTURES if structure.model is function]
     (like,) = defaults or [Structure(name, factory)]
-    full_name = name + f"({', '.join(arguments)})" * bool(arguments)
-    return like._replace(name=full_name, model=factory)
+    if arguments:
+        name = f"{name}({', '.join(arguments)})"
+    return like._replace(name=name, model=factory)
 
 
 def physics_by_name(physics: Any) -> dict[str, Physics]:
@@ -402,10 +408,10 @@ def candidates_of(
             continue
         for name, part in parts.items():
             if part.unknowns or structure.kind == ADJUSTED:
-                full_name = structure.name + f" of {name}" * bool(name)
-                candidates.append((structure._replace(name=full_name), part))
+                named = structure._replace(name=name_of(structure.name, name))
+                candidates.append((named, part))
         if structure.kind == ADJUSTED and [*parts] != [""]:
-            joined = structure._replace(name=f"{structure.name} of all")
+            joined = structure._replace(name=name_of(structure.name, "all"))
             candidates.append((joined, {**parts}))
     if not candidates:
         raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 from gpadjust.core import GP
 from gpadjust.core.data import Data
 from gpadjust.validation.trust import physics_at
-from gpadjust.words import listed, name_and_unit, number, with_unit
+from gpadjust.words import about, listed, name_among, name_and_unit, number, with_unit
 
 _FEWEST = 5  # observations, for any statement
 _MANY = 8  # observations, for the sign or a factor of a twentieth by correlation
@@ -33,27 +34,33 @@ _ROUNDING = 1e-9  # relative; less is rounding
 _STANDARD = 1e-6  # of means and standard deviations that a scaler made
 
 
-def fault_of(data: Data, output: int, f: Tensor) -> str:
-    """Return the obvious fault of a physics with values ``n`` of an output; empty without one."""
+class Fault(NamedTuple):
+    """An obvious fault of a physics."""
+
+    cause: str  # such as "it is about 1,000 times too large"
+    text: str  # its cause with the evidence, and the way out
+
+
+def fault_of(data: Data, output: int, f: Tensor) -> Fault | None:
+    """Return the obvious fault of a physics with values ``n`` of an output; None without one."""
     y = data.Y[:, output]
     is_known = ~y.isnan() & f.isfinite()
     X, y, f = (values[is_known] for values in (data.X, y, f))
     if len(y) < _FEWEST:
-        return ""
-    sd = float(y.std())
-    if sd <= _ROUNDING * rms(y):
-        return ""
-    cause = _cause(data, output, X, y, f)
-    if not cause:
-        return ""
+        return None
+    if is_constant(y):
+        return None
+    fault = _fault(data, output, X, y, f)
+    if fault is None:
+        return None
     name = data.output_names[output]
-    error, spread = (with_unit(number(value), name) for value in (rms(y - f), sd))
+    error, spread = (with_unit(number(value), name) for value in (rms(y - f), y.std()))
     hint = ""
     if _is_standardised(y.unsqueeze(-1)):
         hint = " The observations were standardised: give them in the unit of your formula."
-    return (
-        f"at the data your formula has a root mean square error of {error}, where the observations "
-        f"have a standard deviation of {spread}: {cause}{hint}"
+    return fault._replace(
+        text=f"at the data your formula has a root mean square error of {error}, where the "
+        f"observations have a standard deviation of {spread}: {fault.text}{hint}"
     )
 
 
@@ -62,13 +69,14 @@ def faults(model: GP) -> list[str]:
     texts = []
     for name, values in physics_at(model, model.data.X).items():
         for j, output in enumerate(model.data.output_names):
-            names = [name] * (len(model.physics) > 1) + [output] * (model.num_outputs > 1)
             if fault := fault_of(model.data, j, values[:, j]):
-                texts.append(": ".join([*names, fault]))
+                subjects = [name_among(name, model.physics)]
+                subjects.append(name_among(output, model.data.output_names))
+                texts.append(about(subjects, fault.text))
     return texts
 
 
-def _cause(data: Data, output: int, X: Tensor, y: Tensor, f: Tensor) -> str:
+def _fault(data: Data, output: int, X: Tensor, y: Tensor, f: Tensor) -> Fault | None:
     """Return what is wrong with a formula: scaled inputs, or a sign, an offset or a factor."""
     n = len(y)
     sd = float(y.std())
@@ -76,14 +84,15 @@ def _cause(data: Data, output: int, X: Tensor, y: Tensor, f: Tensor) -> str:
     r = _correlation(y, f)
     bound = _WORSE if r > _FOLLOWS else 1.0
     if rmse > bound * sd and _is_standardised(X):
-        return (
+        return Fault(
+            "it reads scaled inputs",
             "are the inputs scaled? Each column of them has mean 0 and standard deviation 1, and "
             f"the correlation of your formula with the observations is {r:.2f}. It reads raw "
             "units: give the model raw inputs; its input_transform may scale them, and shows your "
-            "formula raw ones."
+            "formula raw ones.",
         )
     if rmse <= _NEAR * rms(y):
-        return ""
+        return None
     factor, by_factor = _factor(y, f, r)
     is_off = rmse > _FAR * sd
     # t = r sqrt((n - 2) / (1 - r^2)) beyond three standard errors
@@ -91,19 +100,23 @@ def _cause(data: Data, output: int, X: Tensor, y: Tensor, f: Tensor) -> str:
     is_worse = n >= _MANY and rmse > _WORSE * sd and r < -_TIGHT
     left_by_opposite = 1.0 if is_off else _LIKE
     if is_opposite and (is_off or is_worse) and rms(f + y) < left_by_opposite * rmse:
+        cause = "it is of the opposite sign"
         large = f", and {_times(factor)}" if abs(factor) > _FACTOR else ""
-        return f"it is of the opposite sign (correlation {r:.2f}){large}."
+        return Fault(cause, f"{cause} (correlation {r:.2f}){large}.")
     is_tiny = n >= _MANY and r > _TIGHT and 0 < factor < 1 / _TINY
     if not is_off and not is_tiny:
-        return ""
+        return None
     offset = float((f - y).mean())
     by_offset = rms(f - y - offset)
     if rmse > _APART * sd and by_offset < _EXPLAINS * rmse and by_offset <= by_factor:
         where = "above" if offset > 0 else "below"
-        return f"it is about {number(abs(offset))} {where} the observations."
+        distance = with_unit(number(abs(offset)), data.output_names[output])
+        cause = f"it is about {distance} {where} the observations"
+        return Fault(cause, f"{cause}.")
     if factor > 0 and not 1 / _FACTOR < factor < _FACTOR:
-        return f"it is {_times(factor)}; {_units(data, output)}"
-    return ""
+        cause = f"it is {_times(factor)}"
+        return Fault(cause, f"{cause}; {_units(data, output)}")
+    return None
 
 
 def _factor(y: Tensor, f: Tensor, r: float) -> tuple[float, float]:
@@ -125,7 +138,7 @@ def _factor(y: Tensor, f: Tensor, r: float) -> tuple[float, float]:
 
 def _correlation(y: Tensor, f: Tensor) -> float:
     """Return the correlation; 0 of a constant f."""
-    if float(f.std()) <= _ROUNDING * rms(f):
+    if is_constant(f):
         return 0.0
     return float(torch.corrcoef(torch.stack([y, f]))[0, 1])
 
@@ -136,6 +149,12 @@ def _is_standardised(values: Tensor) -> bool:
     sd = values.std(0, correction=0)
     ones = torch.stack([(sd - 1).abs(), (values.std(0) - 1).abs()]).amin(0) < _STANDARD
     return bool((mean.abs() < _STANDARD).all() & (ones | (sd == 0)).all() & ones.any())
+
+
+def is_constant(values: Tensor) -> bool:
+    """Return whether values are equal but for rounding, as a single one is."""
+    varies = float(values.std()) > _ROUNDING * rms(values)  # NaN of a single one is not
+    return not varies
 
 
 def rms(values: Tensor) -> float:

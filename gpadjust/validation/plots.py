@@ -49,7 +49,7 @@ from gpadjust.validation.comparison import Comparison
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.scores import Scores
 from gpadjust.validation.trust import SIDES, Trust, physics_at
-from gpadjust.validation.verdict import ALONE, CALIBRATED
+from gpadjust.validation.verdict import ALONE, CALIBRATED, name_of
 from gpadjust.words import labelled
 
 if TYPE_CHECKING:  # it needs pandas
@@ -155,7 +155,9 @@ def plot_adjustment(
     axes = axes_of(axes, len(names), len(lines), 2.6)
     outputs = labels(model.data.output_names)
     inputs = labels(model.data.input_names)
-    suffix = f"\nfor {outputs[output]}" * (len(outputs) > 1)
+    suffix = ""
+    if len(outputs) > 1:
+        suffix = f"\nfor {outputs[output]}"
     for row, name in zip(axes, names, strict=True):
         far_from_data = next(term.mean for term in model.terms if term.name == name)
         for i, (ax, (x, X)) in enumerate(zip(row, lines, strict=True)):
@@ -284,8 +286,9 @@ def plot_parameters(parameters: PhysicsParameters, *, axes: Any = None) -> Any:
         label = labelled(labels([name])[0], unknown.unit)
         if unknown.between is None:
             _plot_density(ax, parameters[name].detach().double(), unknown)
-            ax.set(xlabel=label, ylabel="density" * (ax is axes[0]), yticks=[])
-            ax.set_ylim(0, 1.4 * ax.dataLim.y1)  # room for the legend
+            ax.set(xlabel=label, yticks=[], ylim=(0, 1.4 * ax.dataLim.y1))  # room for the legend
+            if ax is axes[0]:
+                ax.set_ylabel("density")
         else:
             _plot_curve(ax, parameters[name], unknown)
             ax.set(xlabel=unknown.function_of, ylabel=label)
@@ -316,8 +319,7 @@ def _plot_curve(ax: Axes, curve: Curve, unknown: Unknown) -> None:
     x = torch.linspace(low, high, _POINTS).double()
     draws = curve(x)
     ends = draws.quantile(draws.new_tensor([0.025, 0.975]), dim=0)
-    ax.fill_between(x, *ends, color=BLUE, alpha=0.25, lw=0, label="95 %")
-    ax.plot(x, draws.mean(0), color=BLUE, label="mean")
+    band(ax, x, [draws.mean(0), *ends], 0.95)
     half = quantile(0.95)
     for end in unknown.value(torch.tensor([-half, half]).double()).tolist():
         ax.axhline(end, color=GREY, ls=":", lw=1.0)
@@ -421,7 +423,9 @@ def plot_trust(trust: Trust, *, output: int = 0, axes: Any = None) -> Any:
         tidy(ax)
     axes[0].set_ylabel("share of predictions")
     outputs = labels(trust.output_names)
-    title = f"{outputs[output]} " * (len(outputs) > 1) + "rests on"
+    title = "rests on"
+    if len(outputs) > 1:
+        title = f"{outputs[output]} rests on"
     corner = (1.0, 1.0)  # outside the last axes
     legend(axes[-1], title=title, alignment="left", loc="upper left", bbox_to_anchor=corner)
     return axes
@@ -530,7 +534,7 @@ def _symbol(name: str) -> str:
     symbol, _, physics = name.partition("_")
     if symbol not in ("rho", "delta"):
         return name
-    return rf"$\{symbol}$" + f" of {physics}" * bool(physics)
+    return name_of(rf"$\{symbol}$", physics)
 
 
 def quantile(level: float) -> float:

@@ -147,7 +147,9 @@ def physics_at(model: Any, X: Tensor) -> dict[str, Tensor]:
     outputs = model.places(X, model.values).f
     means: dict[str, Tensor] = {}
     for i, f in enumerate(outputs):
-        name = "physics" + f" {names.get(i, i + 1)}" * (len(outputs) > 1)
+        name = "physics"
+        if len(outputs) > 1:
+            name += f" {names.get(i, i + 1)}"
         values = (f * model.unit).mT
         means[name] = model.marginals_of(values, torch.zeros_like(values)).prediction.mean
     return means

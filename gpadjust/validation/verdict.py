@@ -12,7 +12,7 @@ from torch import Tensor
 from gpadjust.core import GP, FitResult
 from gpadjust.kinds.categories import levels_of, numbers_of, on_levels
 from gpadjust.physics import PhysicsError
-from gpadjust.validation.faults import rms
+from gpadjust.validation.faults import Fault, is_constant, rms
 from gpadjust.validation.trust import physics_at
 from gpadjust.words import bare, listed, number, with_unit
 
@@ -20,6 +20,7 @@ ALONE, CALIBRATED, ADJUSTED = "physics alone", "calibrated physics", "adjusted"
 DATA = "data alone"
 AS_IS, CORRECTED = "Use your formula as it is", "Use it corrected"
 NOT, OPEN = "Do not use it", "These data do not tell"
+FAULTY = "Correct your formula"
 _ROUNDING = 1e-9  # relative; less is rounding
 _SURE = 2.0  # standard errors that a difference takes to be real
 _ENOUGH = 8  # observations of different inputs, for any answer
@@ -70,8 +71,9 @@ class Verdict(NamedTuple):
     """The verdict on a physics for an output: should one use it?
 
     Attributes:
-        answer: ``"Use your formula as it is"``, ``"Use it corrected"``, ``"Do not use it"`` or
-            ``"These data do not tell"``.
+        answer: ``"Use your formula as it is"``, ``"Use it corrected"``, ``"Do not use it"``,
+            ``"These data do not tell"``, or of an obvious fault ``"Correct your formula: "`` with
+            its cause, such as ``"it is about 1,000 times too large"``.
         reasons: The reasons, in sentences.
         factor: Factor of the formula where it is used as it is.
         offset: Its offset then, in the unit of the output.
@@ -97,9 +99,18 @@ class Evidence(NamedTuple):
     line: float = math.nan  # error by the formula up to the factor and offset
     factor: float = math.nan  # of the straight line through observations over the formula
     offset: float = math.nan  # of this line
-    fault: str = ""  # the obvious fault of the formula, in words
+    fault: Fault | None = None  # the obvious fault of the formula
     is_surpassed: bool = False  # whether densities show that the correction is needed
     correction_needed: float = math.nan  # probability by nested models; NaN without these
+
+    def in_unit(self, error: float) -> str:
+        """Return an error with the unit of the output."""
+        return with_unit(number(error), self.name)
+
+
+def name_of(kind: str, physics: str) -> str:
+    """Return the name of a structure of one of several physics, such as ``CKA of coarse``."""
+    return f"{kind} of {physics}" if physics else kind
 
 
 def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
@@ -114,8 +125,7 @@ def formulas_of(comparison: Any, names: Sequence[str], j: int) -> dict[str, Tens
     rows = [*comparison.table.values()][j]
     values = {}
     for name in names:
-        suffix = f" of {name}" * bool(name)
-        alone = [f"{kind}{suffix}" for kind in (ALONE, CALIBRATED)]
+        alone = [name_of(kind, name) for kind in (ALONE, CALIBRATED)]
         predicted = [comparison.left_out[key] for key in alone if key in comparison.left_out]
         adjusted = [comparison.models[row.structure] for row in rows if row.kind == ADJUSTED]
         models = [model for model in adjusted if len(model.physics) == 1]
@@ -127,7 +137,7 @@ def formulas_of(comparison: Any, names: Sequence[str], j: int) -> dict[str, Tens
     return values
 
 
-def verdict_of(c: Any, j: int, f: Tensor | None, fault: str) -> Verdict | None:
+def verdict_of(c: Any, j: int, f: Tensor | None, fault: Fault | None) -> Verdict | None:
     """Return the verdict on output j, of a physics with values f; None if nothing is compared."""
     output, rows = [*c.table.items()][j]
     rows = [row for row in rows if row.structure in c.models]
@@ -156,20 +166,15 @@ def verdict_of(c: Any, j: int, f: Tensor | None, fault: str) -> Verdict | None:
     )
     correction = ""
     if f is not None:  # of several physics there is no error of the formula
-        loo = c.left_out[best.structure]
-        y = loo.judged[:, j]
+        y = c.left_out[best.structure].judged[:, j]
         is_judged = ~y.isnan()
         factor, offset, line = straight_line(y[is_judged], f[is_judged])
-        evidence = evidence._replace(
-            alone=float((y - f)[is_judged].square().mean().sqrt()),
-            line=line,
-            factor=factor,
-            offset=offset,
-        )
-        formula = [densities[name] for name in (ALONE, CALIBRATED) if name in densities]
-        if formula:
-            shown = is_shown(densities[adjusted.structure], formula[0])
-            evidence = evidence._replace(is_surpassed=shown)
+        alone = rms((y - f)[is_judged])
+        evidence = evidence._replace(alone=alone, line=line, factor=factor, offset=offset)
+        formula = densities.get(ALONE, densities.get(CALIBRATED))
+        if formula is not None:
+            corrected = difference(densities[adjusted.structure], formula)
+            evidence = evidence._replace(is_surpassed=is_clear(*corrected))
         # That of the recommended model, if it is one that adjusts the formula.
         names = {row.structure for row in rows if row.kind == ADJUSTED}
         correction = correction_of(c.models[c.chosen] if c.chosen in names else model, j, f)
@@ -191,17 +196,23 @@ def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
     observations contradict it; their errors decide whether it needs a correction. The largest
     correction and the most useful next point are in words, or empty.
     """
-
-    def error(value: float) -> str:
-        return with_unit(number(value), e.name)
-
-    # The data do not tell: a fault, too few observations, or a constant.
+    if e.fault is not None:
+        return _faulty(e.fault)
     where = " Observe where the formula has other values."
     if next_point:
         where = f" More observations would tell, the first one {next_point}."
-    if e.fault:
-        fault = f"Your formula seems to be wrong: {e.fault}"
-        return Verdict(OPEN, [fault, "Correct it and run again; no other answer is worth much."])
+    return _undecided(e, where) or _as_it_is(e) or _corrected(e, correction)
+
+
+def _faulty(fault: Fault) -> Verdict:
+    """Return the verdict on a formula with an obvious fault."""
+    reason = fault.text[0].upper() + fault.text[1:]
+    way_out = "Correct it and run again; no other answer is worth much."
+    return Verdict(f"{FAULTY}: {fault.cause}", [reason, way_out])
+
+
+def _undecided(e: Evidence, where: str) -> Verdict | None:
+    """Return the verdict if the data do not tell, or tell that the formula is of no use."""
     if e.number < _ENOUGH:
         few = f"It takes at least {_ENOUGH} observations of different inputs, and there are"
         return Verdict(OPEN, [f"{few} {e.number}.{where}"])
@@ -209,66 +220,80 @@ def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
         same = "Your formula has the same value at all observations, so they cannot judge it."
         return Verdict(OPEN, [f"{same} Observe where it differs."])
 
-    # Is the formula of use?
-    compared = f"Without it the error is {error(e.data)}, with it {error(e.adjusted)}"
-    is_better = e.gain > max(_SURE * e.se, _LEAST)
-    is_worse = -e.gain > max(_SURE * e.se, _LEAST)
+    compared = f"Without it the error is {e.in_unit(e.data)}, with it {e.in_unit(e.adjusted)}"
+    is_better = is_clear(e.gain, e.se)
+    is_worse = is_clear(-e.gain, e.se)
     of_use = e.of_use
     if math.isnan(of_use):  # left-out observations alone decide
-        of_use = 0.5 + 0.5 * is_better - 0.5 * is_worse
+        of_use = 0.5
+        if is_better:
+            of_use = 1.0
+        elif is_worse:
+            of_use = 0.0
     if of_use < 1 - _SURELY and not is_better:
-        return Verdict(NOT, [f"{compared}, and the formula alone is off by {error(e.alone)}."])
-    is_larger = e.adjusted > _LARGER * e.data
-    if of_use <= _SURELY or is_worse or is_larger:
-        doubt = ": too near one another to tell" * (not is_larger)
-        return Verdict(OPEN, [f"{compared}{doubt}.{where}"])
+        alone = f"and the formula alone is off by {e.in_unit(e.alone)}"
+        return Verdict(NOT, [f"{compared}, {alone}."])
+    if e.adjusted > _LARGER * e.data:
+        return Verdict(OPEN, [f"{compared}.{where}"])
+    if of_use <= _SURELY or is_worse:
+        return Verdict(OPEN, [f"{compared}: too near one another to tell.{where}"])
+    return None
 
-    # Is it right as it is, or up to a factor and an offset?
+
+def _as_it_is(e: Evidence) -> Verdict | None:
+    """Return the verdict if the formula is right as it is, or up to a factor and an offset."""
     simple = e.line if e.alone > _LARGER * e.line else e.alone  # NaN of several
     is_as_good = simple <= _LARGER * min(e.adjusted, e.data) or e.correction_needed < _EVEN
-    if is_as_good and not (e.is_surpassed and simple == e.alone):
-        if simple == e.alone:
-            reason = f"Its error is {error(e.alone)}, corrected {error(e.adjusted)}"
-            return Verdict(AS_IS, [f"{reason}, of the data alone {error(e.data)}."])
-        line = f"{number(e.factor)} times your formula"
-        if abs(e.offset) > _NEGLIGIBLE * e.line:
-            sign = "plus" if e.offset > 0 else "less"
-            line += f" {sign} {error(abs(e.offset))}"
-        reason = f"Take {line}: its error is {error(e.line)}, as it is {error(e.alone)}, corrected"
-        return Verdict(AS_IS, [f"{reason} {error(e.adjusted)}."], e.factor, e.offset)
+    if not is_as_good or (e.is_surpassed and simple == e.alone):
+        return None
+    alone, adjusted = map(e.in_unit, (e.alone, e.adjusted))
+    if simple == e.alone:
+        reason = f"Its error is {alone}, corrected {adjusted}, of the data alone"
+        return Verdict(AS_IS, [f"{reason} {e.in_unit(e.data)}."])
+    line = f"{number(e.factor)} times your formula"
+    if abs(e.offset) > _NEGLIGIBLE * e.line:
+        sign = "plus" if e.offset > 0 else "less"
+        line += f" {sign} {e.in_unit(abs(e.offset))}"
+    reason = f"Take {line}: its error is {e.in_unit(e.line)}, as it is {alone}"
+    return Verdict(AS_IS, [f"{reason}, corrected {adjusted}."], e.factor, e.offset)
 
-    # It needs a correction, unless it hardly describes the data.
+
+def _corrected(e: Evidence, correction: str) -> Verdict:
+    """Return the verdict on a formula that needs a correction, unless it hardly fits the data."""
+    alone, adjusted, data = map(e.in_unit, (e.alone, e.adjusted, e.data))
     if e.alone > _HARDLY * e.data and e.line > _LARGER * e.data:
-        alone = f"By itself your formula is off by {error(e.alone)}, the data alone {error(e.data)}"
-        input_only = f"As an input of a model it lowers the error to {error(e.adjusted)}"
-        return Verdict(OPEN, [f"{alone}. {input_only}; check whether it is the right formula."])
-    falls = f"Errors fall from {error(e.alone)} to {error(e.adjusted)}"
+        by_itself = f"By itself your formula is off by {alone}, the data alone {data}"
+        input_only = f"As an input of a model it lowers the error to {adjusted}"
+        return Verdict(OPEN, [f"{by_itself}. {input_only}; check whether it is the right formula."])
+    falls = f"Errors fall from {alone} to {adjusted}"
     if math.isnan(e.alone):
-        falls = f"The error is {error(e.adjusted)}, of the data alone {error(e.data)}"
+        falls = f"The error is {adjusted}, of the data alone {data}"
     elif e.adjusted >= e.alone:
         falls = (
-            f"The error is {error(e.adjusted)}, as it is {error(e.alone)}, but most observations "
-            "are predicted better with the correction"
+            f"The error is {adjusted}, as it is {alone}, but most observations are predicted "
+            "better with the correction"
         )
-    reasons = [f"{falls}{'; ' * bool(correction)}{correction}."]
+    if correction:
+        falls = f"{falls}; {correction}"
+    reasons = [f"{falls}."]
     if e.data <= _LARGER * e.adjusted:
         reasons.append(
-            f"Among these data the data alone do as well ({error(e.data)}); the formula counts "
-            "where there are none."
+            f"Among these data the data alone do as well ({data}); the formula counts where there "
+            "are none."
         )
     return Verdict(CORRECTED, reasons)
 
 
-def is_shown(first: Tensor, second: Tensor) -> bool:
-    """Return whether densities of the first are better by a nat and by two standard errors."""
-    gain, se = difference(first, second)
+def is_clear(gain: float, se: float) -> bool:
+    """Return whether a gain is more than a nat and than two standard errors."""
     return gain > max(_SURE * se, _LEAST)
 
 
 def straight_line(y: Tensor, f: Tensor) -> tuple[float, float, float]:
     """Return factor and offset of y over f by least squares, and the error of left-out ``n``."""
-    varies = float(f.std()) > _ROUNDING * rms(f)
-    columns = [f] * varies + [torch.ones_like(f)]
+    columns = [torch.ones_like(f)]
+    if not is_constant(f):
+        columns.insert(0, f)
     basis = torch.stack(columns, -1)
     q, r = torch.linalg.qr(basis)
     solution = torch.linalg.solve_triangular(r, q.mT @ y.unsqueeze(-1), upper=True).squeeze(-1)
@@ -276,7 +301,7 @@ def straight_line(y: Tensor, f: Tensor) -> tuple[float, float, float]:
     remainder = (1 - q.square().sum(-1)).clamp_min(_ROUNDING)
     error = rms((y - basis @ solution) / remainder)
     *factors, offset = solution.tolist()
-    return sum(factors), offset, error
+    return sum(factors), offset, error  # 0 of a constant, which has no factor
 
 
 @torch.no_grad()
@@ -284,15 +309,20 @@ def correction_of(model: GP, j: int, f: Tensor) -> str:
     """Return the largest correction of a formula's values at the data, in words."""
     X = model.data.X
     corrections = model.predict(X).mean[:, j] - f
-    is_share = bool((f > 0).all() or (f < 0).all())
+    is_share = has_one_sign(f)
     is_large = f.abs() > _TINY_SHARE * f.abs().median()  # where a share says something
     sizes = torch.where(is_large, corrections / f.abs(), 0.0) if is_share else corrections
     i = int(sizes.abs().argmax())
     size = f"{100 * sizes[i]:+.0f} %"
     if not is_share:
-        sign = "+" * bool(sizes[i] > 0)
+        sign = "+" if sizes[i] > 0 else ""
         size = with_unit(f"{sign}{number(sizes[i])}", model.data.output_names[j])
     return f"the largest correction at the data is {size}{_at(model, X[i])}"
+
+
+def has_one_sign(f: Tensor) -> bool:
+    """Return whether values are all positive or all negative, so that they have shares."""
+    return bool((f > 0).all() or (f < 0).all())
 
 
 @torch.no_grad()

@@ -105,7 +105,7 @@ def test_every_model(name):
         assert_right(model, coordinates(model, choice=choice))
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=15, derandomize=True)
 @given(st.integers(0, 2**31), st.sampled_from(list(MODELS)), st.integers(0, 2))
 def test_rows_in_another_order(seed, name, choice):
     X, Y = problem(seed)
@@ -133,7 +133,7 @@ APART = [name for name in MODELS if "unknown" not in name and "calibrated" not i
 APART.remove("two physics with the same parameters")
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=10, derandomize=True)
 @given(st.integers(0, 2**31), st.sampled_from(APART), st.integers(0, 2))
 def test_outputs_are_independent(seed, name, choice):
     X, Y = problem(seed)
@@ -156,7 +156,7 @@ def test_outputs_are_independent(seed, name, choice):
 OFFSETS = st.floats(-1e4, 1e4) | st.sampled_from([1.0, 1e4, 1e8])
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=15, derandomize=True)
 @given(st.integers(0, 2**31), OFFSETS, st.integers(0, 1), st.sampled_from([CKA, RRA]))
 def test_a_constant_of_physics_and_targets(seed, offset, choice, cls):
     X, Y = problem(seed)

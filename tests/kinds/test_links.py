@@ -144,7 +144,7 @@ def test_samples_have_the_quantiles_and_densities():
     st.floats(-6.0, 6.0),
     st.floats(0.01, 0.999),
 )  # fmt: skip
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_predictions_are_within_their_intervals_and_bounds(case, means, log_sd, level):
     name, middle, size = case
     link = Link.parse(name)._replace(location=torch.tensor([middle + math.log(size)]).double())
@@ -159,7 +159,7 @@ def test_predictions_are_within_their_intervals_and_bounds(case, means, log_sd, 
     assert link.value(torch.stack([lower, mean, upper])).isfinite().all()
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     st.sampled_from(["log", "logit", (0.0, 2.0)]),
     st.sampled_from([CKA, PhysicsMeanGP, ZeroMeanGP]),

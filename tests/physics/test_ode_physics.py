@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -70,7 +70,6 @@ def test_substeps_converge_at_the_order_of_the_method(method, order):
     step=st.floats(1e-6, 1e3),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
-@settings(deadline=None)
 def test_substeps_count(substeps, step, dtype):
     calls = []
     physics = ODEPhysics(

@@ -222,6 +222,14 @@ def test_help_has_an_example_and_needs_no_torch():
     assert "--inputs flow,speed --outputs head --physics pump:head" in run.stdout
 
 
+def test_the_help_on_logs_says_what_is_in_python_alone(capsys):
+    with pytest.raises(SystemExit):
+        main(["identify", "--help"])
+    words = " ".join(capsys.readouterr().out.split())
+    _, _, text = words.partition("In Python alone")
+    assert re.search(r"identify: sensors with unknown gains.* \(by_free_runs=True\)", text)
+
+
 @pytest.mark.slow
 def test_kinds_of_data(folder, read, undrawn):
     rigs = ["old", "new", "lent"]

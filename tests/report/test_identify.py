@@ -10,9 +10,12 @@ import torch
 
 from gpadjust.__main__ import main
 from gpadjust.physics import Unknown
-from gpadjust.records import Records, identify
-from gpadjust.report import report
+from gpadjust.records import Identification, Records, identify
+from gpadjust.report import log_page, report
 from gpadjust.report.inputs import unknown_of
+from gpadjust.report.subject import Origin
+
+from .conftest import Page
 
 LOG = Path(__file__).parents[2] / "examples" / "swing.csv"
 TRUE = {"l": 0.6, "c": 0.15, "J": 0.4, "F": 0.1}  # of the simulation
@@ -123,6 +126,20 @@ def test_without_actions_there_is_the_time_and_next_values_are_equations_too(
     text = (folder / "identify.html").read_text()
     assert "0.9 to 0.9" in text
     assert "ODEPhysics" not in text
+
+
+@pytest.mark.parametrize("program", ["machine = identify(records, physics)", ""])
+def test_what_the_command_does_not_offer_is_in_python(program, monkeypatch, undrawn):
+    from tests.records.test_identification import SPEC, oscillation, quickly, spring
+
+    found = quickly(Records(oscillation(80), SPEC), spring(Unknown(1.5, factor=1.5)))
+    sentence = "Fitted to free runs (`by_free_runs=True`) the physics has a smaller error."
+    advice = property(lambda machine: [sentence])
+    monkeypatch.setattr(Identification, "advice", advice)
+    text = Page(log_page.page(found, None, Origin(program=program)).sections["Advice"]).text
+    way_out = "to identify in the program below, in Python." if program else sentence
+    assert text.startswith(sentence)
+    assert text.endswith(way_out)
 
 
 def test_guesses_that_diverge_are_beaten_and_have_no_number(folder, read, undrawn):

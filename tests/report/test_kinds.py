@@ -32,9 +32,7 @@ def physics(m):
 
 
 @pytest.mark.slow
-@settings(
-    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.text(min_size=1, max_size=12), st.text(min_size=1, max_size=12))
 @example(NASTY[0], NASTY[1])
 @example(NASTY[1], NASTY[2])

@@ -9,14 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gpadjust.core import CKA, CalibratedPhysics, ZeroMeanGP, fit, load
+from gpadjust.kinds import with_options
 from gpadjust.physics import FunctionPhysics, PhysicsError, Unknown
 from gpadjust.report import figures, report, tables
 from gpadjust.report.markup import Markup, failure, side_by_side, table, tag
-from gpadjust.report.page import cards, headline
+from gpadjust.report.page import cards, formula_of, headline
 from gpadjust.report.subject import Adjusted, subject_of
 from gpadjust.validation import Verdict
 from gpadjust.validation.plots import lines_along
-from gpadjust.words import name_and_unit, number
+from gpadjust.words import about, listed, name_among, name_and_unit, number, plural, shortened
 from tests.systems import line
 
 from .conftest import Page, f_p
@@ -105,6 +106,35 @@ def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch, undraw
     torch.testing.assert_close(names["mean"], model.predict(names["X"]).mean)
 
 
+@pytest.mark.parametrize(
+    ("link", "formula", "scale"),
+    [
+        (None, "prediction = rho(x) formula(x) + delta(x)", ""),
+        (
+            "log",
+            "log(prediction) = rho(x) log(formula(x)) + delta(x)",
+            ", on the scale of log(y)",
+        ),
+        (
+            (1, 3),
+            "log((prediction - 1) / (3 - prediction)) = "
+            "rho(x) log((formula(x) - 1) / (3 - formula(x))) + delta(x)",
+            ", on the scale of log((y - 1) / (3 - y))",
+        ),
+    ],
+)
+def test_the_adjustment_is_on_the_scale_of_the_link(link, formula, scale):
+    X = line(7)
+    options = {} if link is None else {"link": link}
+    model = with_options(CKA, options)(X, 1.5 + X, physics=lambda X: 1.2 + X)
+    fit(model, "map")
+    subject = subject_of(model)
+    assert formula_of(subject) == formula
+    text = "a scale and a bias that depend on the inputs"
+    assert tables.described("CKA", subject.link).endswith(f"{text}{scale}")
+    assert tables.described("zero mean", subject.link).endswith("of the data alone")
+
+
 def test_a_model_without_physics(tmp_path, read, undrawn):
     X = torch.rand(7, 1, dtype=torch.float64)
     model = ZeroMeanGP(X, X.sin())
@@ -124,6 +154,7 @@ def test_the_verdict_and_its_color(comparison):
         ("Use it corrected", "yes"),
         ("Do not use it", "no"),
         ("These data do not tell", "open"),
+        ("Correct your formula: it is about 1,000 times too large", "open"),
     ):
         verdict = Verdict(answer, ["One reason.", "Another."])
         shown = cards(subject_of(dataclasses.replace(comparison, verdict={"y": verdict})))
@@ -252,6 +283,13 @@ def test_numbers_and_names_with_units():
     assert {value: number(value) for value in numbers} == numbers
     names = {"head [m]": ("head", "m"), "x[0]": ("x", "0"), "[m]": ("[m]", ""), "a": ("a", "")}
     assert {text: name_and_unit(text) for text in names} == names
+
+
+def test_counts_lists_and_subjects():
+    assert [plural(n, "row") for n in (0, 1, 1200)] == ["0 rows", "1 row", "1,200 rows"]
+    assert [listed("abc"[:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
+    assert [shortened("abc", n) for n in (3, 2)] == [["a", "b", "c"], ["a", "b", "1 more"]]
+    assert about([name_among("y", ["y"]), name_among("z", ["y", "z"])], "low") == "z: low"
 
 
 @pytest.mark.parametrize(("form", "pairs"), [("sum", 1), ("line", 0)])

@@ -27,7 +27,7 @@ def check(spec, states, following, actions=None):
     spec.check_transitions(states, actions, following)
 
 
-@settings(deadline=None, derandomize=True)
+@settings(derandomize=True)
 @given(angle=st.floats(-50, 50), position=st.floats(-1e3, 1e3))
 def test_observations_are_decoded(angle, position):
     spec = StateSpec(["x", "theta"], ["a"], angles=["theta"])

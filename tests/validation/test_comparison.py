@@ -1,6 +1,7 @@
 """`compare`: its numbers, its rankings, what it recommends and says about the physics."""
 
 import math
+import re
 import sys
 import warnings
 from functools import partial
@@ -18,10 +19,12 @@ from gpadjust.kinds.links import Linked
 from gpadjust.physics import FunctionPhysics, Unknown, as_physics
 from gpadjust.validation import STRUCTURES, Structure, compare, leave_one_out
 from gpadjust.validation.comparison import candidates_of, checked_structures, physics_by_name
+from gpadjust.validation.faults import Fault
 from gpadjust.validation.leave_one_out import _with_noise, left_out_by_physics
 from gpadjust.validation.verdict import (
     AS_IS,
     CORRECTED,
+    FAULTY,
     NOT,
     OPEN,
     Evidence,
@@ -262,7 +265,7 @@ GOOD = Evidence(
         ({"adjusted": 0.4}, OPEN, "Without it the error is 0.3 N, with it 0.4"),
         ({"number": 7}, OPEN, "at least 8 observations"),
         ({"factor": 0.0}, OPEN, "the same value at all observations"),
-        ({"fault": "it is off"}, OPEN, "seems to be wrong: it is off"),
+        ({"fault": Fault("it is off", "by 2")}, f"{FAULTY}: it is off", "By 2 Correct it and run"),
         ({"of_use": math.nan}, CORRECTED, "Errors fall"),  # by left-out observations alone
         ({"of_use": math.nan, "gain": 0.9, "se": 0.1}, OPEN, "Without it"),
         ({"of_use": math.nan, "gain": -9.0}, NOT, "Without it the error is 0.3 N"),
@@ -320,7 +323,10 @@ def test_a_formula_that_is_off_by_a_factor_is_never_used():
     with pytest.warns(PhysicsWarning, match="times too small; are its units those") as caught:
         comparison = compare(X, 1000 * (2 + (6 * X).sin() + noise), law)
     assert [warning.filename for warning in caught] == [__file__]  # once
-    assert comparison.verdict["y"].answer == OPEN
+    assert re.fullmatch(
+        r"Correct your formula: it is about [\d,]+ times too small", comparison.verdict["y"].answer
+    )
+    assert comparison.verdict["y"].reasons[0].startswith("At the data your formula has a root mean")
     assert "times too small" in comparison.verdict["y"].reasons[0]
 
 

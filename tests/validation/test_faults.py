@@ -31,7 +31,7 @@ def said(X, Y, physics):
     data, values = Data.read(X, Y, None, None), as_physics(physics)(X)
     found = [fault_of(data, j, f) for j, f in enumerate(values.mT)]
     names = [f"{name}: " for name in data.output_names] if len(found) > 1 else [""]
-    return "; ".join(name + text for name, text in zip(names, found, strict=True) if text)
+    return "; ".join(name + fault.text for name, fault in zip(names, found, strict=True) if fault)
 
 
 def test_the_cause_is_told(X, Y):
@@ -47,6 +47,21 @@ def test_the_cause_is_told(X, Y):
     text = said(X, 1e3 * Y, lambda X: 1e3 * law(X) + 3e4)
     assert "root mean square error of 30000, where the observations" in text
     assert "standard deviation of 526: it is about 30000 above the observations." in text
+
+
+def test_the_cause_is_a_headline():
+    X = line(12, 0.05)
+    data = Data.read(X, 1e3 * law(X), None, None)._replace(output_names=("T [K]",))
+    for f, cause in (
+        (1e6 * law(X), "it is about 1,000 times too large"),
+        (-1e3 * law(X), "it is of the opposite sign"),
+        (1e3 * law(X) + 2e4, "it is about 20000 K above the observations"),
+    ):
+        fault = fault_of(data, 0, f[:, 0])
+        assert fault.cause == cause
+        assert cause in fault.text
+    scaled = Data.read((X - X.mean()) / X.std(), law(X), None, None)
+    assert fault_of(scaled, 0, law(scaled.X)[:, 0]).cause == "it reads scaled inputs"
 
 
 def test_a_crude_physics_is_not_complained_of(X, Y):
