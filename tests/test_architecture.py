@@ -55,14 +55,13 @@ AVOIDED = re.compile(
     r"\b(next to nothing|by the default fit|of one's own|is none|(is|are) said|says?|told|"
     r"whether to|goes on|pays|errs?|look at it)\b"
 )
-GOLF_NOT_YET = {"core", "many", "records"}  # rooms where truth values still count as numbers
+GOLF_NOT_YET = {"records"}  # rooms where truth values still count as numbers
 MASKS = {  # true arithmetic: tensors of 0 and 1
     ("control/rollouts.py", "violation.max() * left"),
     ("core/kernels.py", "slope * (e < 0)"),
     ("kinds/categories.py", "own['outputscale'].unsqueeze(-1) * same"),
     ("many/conditioning.py", "(targets - total.mean).nan_to_num() * is_observed"),
     ("many/conditioning.py", "residual.nan_to_num() * self.is_late"),
-    ("many/rest.py", "has_rest * kernel.covariance(numbers, groups)"),
 }
 TRUTHS = {"bool", "isinstance", "issubclass", "callable", "hasattr", "any", "all", "isfinite"}
 TRUTHS |= {"isnan", "startswith", "endswith"}  # functions, besides those annotated as bool
