@@ -189,6 +189,18 @@ def checked_points(name: str, X: Any, columns: int, bounds: Tensor | None = None
     return X
 
 
+def checked_columns(name: str, asked: Any, names: Sequence[str]) -> list[int]:
+    """Return the numbers of columns that are asked for, one or several, by name or number."""
+    numbers: dict[Any, int] = {column: i for i, column in enumerate(names)}
+    numbers |= {i: i % len(names) for i in range(-len(names), len(names))}
+    several = [asked] if isinstance(asked, str | int) else [*asked]
+    unknown = [column for column in several if column not in numbers]
+    if unknown:
+        expected = f"{name} by names or numbers of the inputs {', '.join(names)}"
+        raise ValueError(f"Expected {expected}; found {unknown[0]!r}.")
+    return [numbers[column] for column in several]
+
+
 def check_columns(name: str, tensor: Tensor, columns: int, more: bool = False) -> None:
     """Raise an error unless a tensor is floating-point and ``... x columns`` (or ``more``)."""
     if not torch.is_tensor(tensor) or not tensor.is_floating_point():

@@ -23,7 +23,6 @@ CHAPTERS = {
     "kinds": ("Kinds",),
     "control": ("Known", "First"),
     "misled": ("Misled",),
-    "simulators": ("Simulators",),
 }
 """Folders, and the classes of the experiments that they declare."""
 EXPERIMENTS = {
@@ -48,30 +47,38 @@ def main() -> None:
     elif name in FIGURES and {*arguments} <= {"--quick"}:
         _figure(FIGURES[name], quick=bool(arguments))
     elif name == "all" and {*arguments} <= {"--only-tables"}:
-        refused = []
-        for each in EXPERIMENTS:
-            print(f"\n{each}: {_about(each)}")
-            try:
-                _run(each, ["--out", f"{Path(__file__).parent}/results", *arguments])
-            except SystemExit as error:
-                refused.append(f"{each}: {error}")
-        import_module("paper.pages").report()
-        if refused:
-            raise SystemExit("\nNothing was run of these:\n" + "\n".join(refused))
+        _all(arguments)
     elif name == "report" and not arguments:
         import_module("paper.pages").report()
     elif name == "check" and {*arguments} <= {"--write"}:
         import_module("paper.check").main(EXPERIMENTS, write=bool(arguments))
+    elif {"-h", "--help"} & {name, *arguments}:
+        print(_usage())
+        raise SystemExit(0)
+    elif name in _OTHER:
+        raise SystemExit(f"{name}: unknown options {' '.join(arguments)}; see --help.")
     else:
-        lines = [f"  {known:<15}{_about(known)}" for known in EXPERIMENTS]
-        lines += [f"  {known:<15}{what}" for known, what in _OTHER.items()]
-        usage = f"usage: python -m paper experiment [options]\n\n{__doc__}\n" + "\n".join(lines)
-        if {"-h", "--help"} & {name, *arguments}:
-            print(usage)
-            raise SystemExit(0)
-        if name in _OTHER:
-            raise SystemExit(f"{name}: unknown options {' '.join(arguments)}; see --help.")
-        raise SystemExit(f"{usage}\n\nThere is no experiment {name!r}.")
+        raise SystemExit(f"{_usage()}\n\nThere is no experiment {name!r}.")
+
+
+def _usage() -> str:
+    names = {name: _about(name) for name in EXPERIMENTS} | _OTHER
+    lines = [f"  {name:<15}{what}" for name, what in names.items()]
+    return f"usage: python -m paper experiment [options]\n\n{__doc__}\n" + "\n".join(lines)
+
+
+def _all(arguments: list[str]) -> None:
+    """Run what is missing of each experiment, then report; say at the end what was refused."""
+    refused = []
+    for name in EXPERIMENTS:
+        print(f"\n{name}: {_about(name)}")
+        try:
+            _run(name, ["--out", f"{Path(__file__).parent}/results", *arguments])
+        except SystemExit as error:
+            refused.append(f"{name}: {error}")
+    import_module("paper.pages").report()
+    if refused:
+        raise SystemExit("\nNothing was run of these:\n" + "\n".join(refused))
 
 
 def _about(name: str) -> str:

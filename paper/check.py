@@ -20,7 +20,6 @@ from paper.common.runner import (
     made_otherwise,
     runs_file,
     stale_list,
-    tables_of,
     write_tables,
 )
 from paper.common.runs import rounded
@@ -97,8 +96,9 @@ def _older(run: Run, experiment: Experiment) -> str:
 def _again(name: str, experiment: Experiment, case: Case, run: Run) -> tuple[str, str, float]:
     torch.set_num_threads(1)
     start = time.process_time()
-    results = rounded(experiment.changed(experiment.cheap).run(*case))
-    return name, difference(run, results), time.process_time() - start
+    results = experiment.changed(experiment.cheap).run(*case)
+    made = difference(run, rounded(results, experiment.digits))
+    return name, made, time.process_time() - start
 
 
 def difference(old: Any, new: Any, place: str = "") -> str:
@@ -133,7 +133,7 @@ def main(experiments: dict[str, str], write: bool) -> None:
             experiment = resolve_name(kind)(out=PAPER / "results")
             runs = [*runs_file(experiment).read().values()]
             if runs:
-                write_tables(experiment, tables_of(experiment, runs))
+                write_tables(experiment, runs)
         report()
     tables = results(PAPER / "results")
     wrong = [f"{p.name}: {q}" for p in QUOTING for q in wrong_quotes(p.read_text(), tables)]

@@ -37,7 +37,7 @@ ALLOWED = {
         "physics/base.py forward",
     },
     "drawn on the CPU, so that a seed says the same everywhere, and moved": {
-        "core/kernels.py __init__",
+        "core/fourier.py __init__",
         "core/model.py sample_functions",
         "core/stacked.py sample_functions",
     },

@@ -65,8 +65,7 @@ class Data(NamedTuple):
         if is_seldom.any():
             columns = marked_rows(is_seldom)
             raise ValueError(f"Expected at least 2 targets of each output; leave out {columns}.")
-        X = X.detach().clone()
-        Y = Y.detach().clone()
+        X, Y = (tensor.detach().clone() for tensor in (X, Y))
         Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y)
         if input_transform is not None:
             input_transform(X)
@@ -138,9 +137,8 @@ def as_tensor(values: ArrayLike, name: str) -> Tensor:
         if values.is_complex():
             raise _no_numbers(name, [str(values.dtype)])
         if values.dtype != torch.float64:  # Cholesky factors of these kernels fail in float32
-            raise TypeError(
-                f"Expected {name} in float64; found {values.dtype}; take `{name}.double()`."
-            )
+            kind = f"{values.dtype}; take `{name}.double()`"
+            raise TypeError(f"Expected {name} in float64; found {kind}.")
         return values
     if hasattr(values, "to_frame"):  # a Series is a column
         values = values.to_frame()
@@ -149,9 +147,7 @@ def as_tensor(values: ArrayLike, name: str) -> Tensor:
         kind = type(values).__name__
         raise TypeError(f"Expected {name} as a tensor, an array or a frame; found {kind}.")
     if np.ma.is_masked(array):
-        raise ValueError(
-            f"Expected {name} unmasked; take `{name}.filled(np.nan)`, or leave out rows."
-        )
+        raise ValueError(f"Expected {name} unmasked; leave out rows or `{name}.filled(np.nan)`.")
     types = {array.dtype.type}
     if array.dtype.kind == "O":
         types = {type(value) for value in array.flat}
@@ -207,18 +203,6 @@ def names_of(values: ArrayLike, letter: str) -> tuple[str, ...]:
     if len(shape) < 2 or shape[-1] == 1:
         return (letter,)
     return tuple(f"{letter}{i + 1}" for i in range(int(shape[-1])))
-
-
-def columns_of(names: Sequence[str], asked: Any, what: str) -> list[int]:
-    """Return the numbers of columns that are asked for, one or several, by name or number."""
-    numbers: dict[Any, int] = {name: i for i, name in enumerate(names)}
-    numbers |= {i: i % len(names) for i in range(-len(names), len(names))}
-    several = [asked] if isinstance(asked, str | int) else [*asked]
-    unknown = [column for column in several if column not in numbers]
-    if unknown:
-        expected = f"{what} by names or numbers of the inputs {', '.join(names)}"
-        raise ValueError(f"Expected {expected}; found {unknown[0]!r}.")
-    return [numbers[column] for column in several]
 
 
 def column_names(values: ArrayLike) -> tuple[str, ...] | None:

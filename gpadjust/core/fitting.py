@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from bisect import bisect_left
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.core.noise import Noise
 from gpadjust.core.nuts import CHAINS, nuts
 from gpadjust.core.sample import GROUPS, Draws, Normal, around_mode, maximise, sample
 from gpadjust.core.straight import Straight
-from gpadjust.core.threads import threads_for
 from gpadjust.core.unknowns import standard_normal
 from gpadjust.physics.least_squares import least_squares_fit
 from gpadjust.progress import long_work
+from gpadjust.threads import threads_for
 
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
@@ -80,7 +81,7 @@ class FitResult:
         outputs = [*zip(*self.probabilities.values(), strict=True)]
         for j, shares in enumerate(outputs):
             parts = [f"{text} {p:.2f}" for text, p in zip(self.probabilities, shares, strict=True)]
-            output = f" (output {j + 1})" * (len(outputs) > 1)
+            output = f" (output {j + 1})" if len(outputs) > 1 else ""
             lines.append(f"Probabilities{output}: {', '.join(parts)}.")
         if self.method == "map":
             lines.append("Point fit: intervals ignore the uncertainty of the hyper-parameters.")
@@ -105,18 +106,17 @@ def fit(
     ``"bayes"`` draws all unknown numbers from their posterior: by sequential Monte Carlo from the
     prior up to 40 points, from Laplace's approximation beyond; beyond 100 points (200 if outputs
     share unknown numbers, as parameters of a physics) its draws are weighted once and not moved.
-    Nested models are drawn from apart and pooled by their posterior probabilities. ``"map"``
-    finds the most likely numbers of the whole model. ``"nuts"`` draws from the same density by
-    Pyro's NUTS, in four chains that also jump around draws of the default fit: a slow reference, of
-    a model without nested ones. After five seconds a bar of tqdm shows the progress.
+    Nested models are pooled by their posterior probabilities. ``"map"`` finds the most likely
+    numbers of the whole model. ``"nuts"`` is a slow reference without nested models: Pyro's NUTS in
+    four chains that also jump around draws of the default fit. A bar shows progress after 5 s.
 
     Args:
         model: The model.
         method: ``"bayes"``, ``"map"`` or ``"nuts"``.
         num_draws: Number of draws, a multiple of 4 (of NUTS from 16 on); predictions average over a
             quarter of them. Default: 80, 32 (of more than 40 points) or 16 (of more than 100), or
-            256, 128 or 64 if outputs share unknown numbers, as parameters of a physics; predictions
-            then average over 16, 8 or 4 of them. Of NUTS 640, after half as many to adapt.
+            256, 128 or 64 if outputs share unknown numbers; predictions then average over 16, 8 or
+            4 of them. Of NUTS 640, after half as many to adapt.
         seed: Seed.
 
     Warns:
@@ -125,7 +125,7 @@ def fit(
     Raises:
         ValueError: If the method or number of draws is unknown, or the data are a batch; of NUTS
             also if there are nested models or no density.
-        TypeError: If it is not a model of this library.
+        TypeError: If it is not a model of this library, or num_draws is not a whole number.
         ImportError: Of NUTS, if Pyro is not installed.
 
     Example:
@@ -136,8 +136,11 @@ def fit(
         True
     """
     if not hasattr(model, "log_likelihood"):
-        raise TypeError(f"Expected a model of gpadjust.core; found {type(model).__name__}.")
-    if method not in ("bayes", "map", "nuts"):
+        raise TypeError(
+            f"Expected a model of gpadjust.core; found {type(model).__name__}. Of a list fit each "
+            "model: for part in model.models: fit(part)."
+        )
+    if method not in tuple(_METHODS):
         raise ValueError(f"Unknown method {method!r}; expected 'bayes', 'map' or 'nuts'.")
     if method == "nuts" and not model.has_density:
         kind = type(model).__name__
@@ -145,17 +148,19 @@ def fit(
     if method == "nuts" and model.table.choices:
         raise ValueError("NUTS does not draw from nested models; build it with nested=False.")
     least = 4 * CHAINS if method == "nuts" else 4  # R-hat needs four draws a chain
-    if num_draws is not None and (num_draws < least or num_draws % 4):
-        raise ValueError(
-            f"Expected num_draws as a multiple of 4, from {least} on; found {num_draws}."
-        )
+    if num_draws is not None:
+        num_draws = checked_whole("num_draws", num_draws)
+        if num_draws < least or num_draws % 4:
+            expected = f"a multiple of 4, from {least} on"
+            raise ValueError(f"Expected num_draws as {expected}; found {num_draws}.")
     if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")
     with threads_for(len(model.data.Y)), long_work("fit", "evaluations"):
         result: FitResult | None = model.fit_itself(method, num_draws, seed)
         if result is None:
-            result = _fitted(model, method, num_draws, seed)
+            model.noise = model.noise.learnt(model, partial(_roughly_fitted, model, seed))
+            result = _METHODS[method](model, num_draws, seed)
     if result.rhat > _MIXED:
         warnings.warn(
             f"Chains do not agree, split R-hat is {result.rhat:.2f}. Draw more: "
@@ -171,23 +176,29 @@ def fit(
     return result
 
 
-def _fitted(model: GP, method: str, num_draws: int | None, seed: int) -> FitResult:
-    """Set draws of a model, or the most likely coordinates."""
-    model.noise = model.noise.learnt(model, partial(_roughly_fitted, model, seed))
-    if method == "map":
-        mode = modes(model, 0, seed, is_precise=True)[:1]
-        if model.table.shared:
-            start, _ = around_mode(partial(model.log_likelihood, choice=0), mode[0], True)
-            mode = model.table.with_choice(start.mean.unsqueeze(0), 0)
-        model.set_draws(mode)
-        return FitResult(method)
-    if method == "nuts":
-        number = num_draws or _OF_NUTS
-        first = _sampled(model, _BEFORE_NUTS, seed)[0].u
-        draws, rhat = nuts(model, first, number, seed)
-        model.set_draws(draws, number // 4)
-        return FitResult(method, num_draws=len(model.u), rhat=rhat)
-    number, averaged = (num_draws, num_draws // 4) if num_draws else _default_numbers(model)
+def _most_likely(model: GP, num_draws: int | None, seed: int) -> FitResult:
+    """Set the most likely coordinates of the whole model; a number of draws has no effect."""
+    mode = modes(model, 0, seed, is_precise=True)[:1]
+    if model.table.shared:
+        start, _ = around_mode(partial(model.log_likelihood, choice=0), mode[0], True)
+        mode = model.table.with_choice(start.mean.unsqueeze(0), 0)
+    model.set_draws(mode)
+    return FitResult("map")
+
+
+def _by_nuts(model: GP, num_draws: int | None, seed: int) -> FitResult:
+    """Set draws by NUTS, which begins with those of the default fit."""
+    number = num_draws or _OF_NUTS
+    draws, rhat = nuts(model, _sampled(model, _BEFORE_NUTS, seed)[0].u, number, seed)
+    model.set_draws(draws, number // 4)
+    return FitResult("nuts", num_draws=len(model.u), rhat=rhat)
+
+
+def _averaged(model: GP, num_draws: int | None, seed: int) -> FitResult:
+    """Set draws of all nested models, pooled by their probabilities."""
+    number, averaged = _default_numbers(model)
+    if num_draws is not None:
+        number, averaged = num_draws, num_draws // 4
     sampled = _sampled(model, number, seed)
     weights = _weights(model, {k: draws.log_evidence for k, draws in sampled.items()})
     shares = weights.mean(1)  # K x B
@@ -196,17 +207,22 @@ def _fitted(model: GP, method: str, num_draws: int | None, seed: int) -> FitResu
     half = number // GROUPS
     slices = [slice(g * half, (g + 1) * half) for g in range(GROUPS)]
     groups = [_pooled(sampled, weights[:, g], half, slices[g]) for g in range(GROUPS)]
-    has_unknowns = any(f_p.unknowns for f_p in model.physics)
+    parameter_error = math.nan
+    if any(f_p.unknowns for f_p in model.physics):
+        parameter_error = _parameter_error(model, groups)
     choices = zip(model.table.choices, shares.expand(-1, len(model.unit)).tolist(), strict=False)
     return FitResult(
-        method,
+        "bayes",
         _evidence(model, sampled),
         {choice.text: probabilities for choice, probabilities in choices},
         min(float(draws.effective.min()) for draws in sampled.values()),
         _error(model, groups) * math.sqrt(number / averaged),
         len(model.u),
-        _parameter_error(model, groups) if has_unknowns else math.nan,
+        parameter_error,
     )
+
+
+_METHODS = {"bayes": _averaged, "map": _most_likely, "nuts": _by_nuts}
 
 
 def _roughly_fitted(model: GP, seed: int, noise: Noise) -> GP:
@@ -218,35 +234,53 @@ def _roughly_fitted(model: GP, seed: int, noise: Noise) -> GP:
 
 def _default_numbers(model: GP) -> tuple[int, int]:
     """Return the number of draws, and over how many of them predictions average."""
-    n = model.targets().shape[-1]
-    size = (n > _SMALL) + (n > _MEDIUM)
+    size = bisect_left((_SMALL, _MEDIUM), model.targets().shape[-1])  # up to 40, 100
     drawn = (256, 128, 64) if model.table.shared else (80, 32, 16)
     return drawn[size], (16, 8, 4)[size]
 
 
 def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     """Return draws of each nested model; of more than 40 rows of each that is likely enough."""
-    n, is_shared = model.targets().shape[-1], bool(model.table.shared)
-    is_small = n <= _SMALL
-    draw = partial(sample, like=model.u.detach()[0], number=number, seed=seed)
-    late = partial(draw, first=_FIRST, with_moves=n <= (_SHARED if is_shared else _MEDIUM))
-    starts: dict[int, Normal] = {}
-    if is_shared or not is_small:
-        starts = _starts(model, seed)
+    is_small = model.targets().shape[-1] <= _SMALL
     sampled: dict[int, Draws] = {}
-    for k in range(len(model.table.log_prior)) if is_small else starts:
+    if is_small:
+        sampled = _from_prior(model, number, seed)
+    if model.table.shared:
+        sampled |= _around_ridges(model, sampled, number, seed)
+    elif not is_small:
+        sampled = _around_modes(model, number, seed)
+    with_choice = model.table.with_choice
+    return {k: draws._replace(u=with_choice(draws.u, k)) for k, draws in sampled.items()}
+
+
+def _from_prior(model: GP, number: int, seed: int) -> dict[int, Draws]:
+    """Return draws of each nested model that begin with its prior."""
+    like = model.u.detach()[0]
+    choices = range(len(model.table.log_prior))
+    return {k: sample(partial(model.log_likelihood, choice=k), like, number, seed) for k in choices}
+
+
+def _around_modes(model: GP, number: int, seed: int) -> dict[int, Draws]:
+    """Return draws of each likely nested model that begin with Laplace's approximation."""
+    like, with_moves = model.u.detach()[0], model.targets().shape[-1] <= _MEDIUM
+    sampled = {}
+    for k, start in _starts(model, seed).items():
         density = partial(model.log_likelihood, choice=k)
-        if is_small:
-            draws = draw(density)
-        if is_shared and k in starts:
-            straight = Straight(model, starts[k], k)
-            points = straight.points(_FIRST * number, seed)
-            around = late(straight, start=straight.start, points=points)
-            around = around._replace(u=straight.coordinates(around.u))
-            draws = _joined(around, draws, straight.misses(draws.u)) if is_small else around
-        elif not is_small:
-            draws = late(density, start=starts[k])
-        sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
+        sampled[k] = sample(density, like, number, seed, start, _FIRST, with_moves)
+    return sampled
+
+
+def _around_ridges(model: GP, others: dict[int, Draws], number: int, seed: int) -> dict[int, Draws]:
+    """Return the same in coordinates in which ridges are straight, and what others reach beyond."""
+    like, with_moves = model.u.detach()[0], model.targets().shape[-1] <= _SHARED
+    sampled = {}
+    for k, start in _starts(model, seed).items():
+        straight = Straight(model, start, k)
+        points = straight.points(_FIRST * number, seed)
+        draws = sample(straight, like, number, seed, straight.start, _FIRST, with_moves, points)
+        sampled[k] = draws._replace(u=straight.coordinates(draws.u))
+        if k in others:
+            sampled[k] = _joined(sampled[k], others[k], straight.misses(others[k].u))
     return sampled
 
 
@@ -317,7 +351,7 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     number = max(16, 6400 // max(len(model.data.Y), 25))
     generator = torch.Generator().manual_seed(seed)
     u = standard_normal((number, *like.shape), generator, like)
-    searches = _SEARCHES // (1 + (choice > 0))
+    searches = _SEARCHES // 2 if choice else _SEARCHES
     begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
     if model.table.shared:
         begins[-2] = _with_least_squares(model, choice, u)
@@ -382,7 +416,7 @@ def _evidence(model: GP, sampled: dict[int, Draws]) -> Tensor:
 
 
 def _pooled(
-    draws: Mapping[int, Draws], weights: Tensor, number: int, group: slice = slice(None)
+    draws: dict[int, Draws], weights: Tensor, number: int, group: slice = slice(None)
 ) -> Tensor:
     """Return ``number x B x P`` draws of nested models, all or a group, by weights ``K x B``."""
     problems = []

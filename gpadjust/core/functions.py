@@ -63,13 +63,12 @@ class Functions(torch.nn.Module):
             raise ValueError(f"Expected {expected}; found {tuple(X.shape)}.")
         return self._values(self.model.evaluate_each(X, self.data.train.values))
 
-    def _values(self, f: WeightedSum) -> Tensor:
+    def _values(self, f: WeightedSum) -> Any:
         """Return the functions at the places of a sum, ``... x k x q x m``."""
         cross = f.cross(self.data.train) * self.data.observed.unsqueeze(-2)
         # m(x) + phi(x)^T w + k(x, X) v
         values = self._prior(f) + (cross @ self.update.unsqueeze(-1)).squeeze(-1)
-        Y: Tensor = self.model.off_gaussian_scale((values * self.model.unit).mT)
-        return Y
+        return self.model.off_gaussian_scale((values * self.model.unit).mT)
 
     def _prior(self, f: WeightedSum) -> Tensor:
         """Return the functions from the prior, ``... x k x m x q``."""

@@ -101,8 +101,7 @@ def sum_likelihood(
     K, pull_back = train.with_pull_back()
     K = K.expand(*residual.shape, residual.shape[-1])
     value, by_mean, D = log_likelihood(residual, K, noise, observed)
-    by_variance = D.diagonal(dim1=-1, dim2=-2)
-    return SumLikelihood(value, pull_back(D), by_mean, by_variance)
+    return SumLikelihood(value, pull_back(D), by_mean, D.diagonal(dim1=-1, dim2=-2))
 
 
 class Conditioning:
@@ -210,7 +209,7 @@ class Conditioning:
         """Return means without k, which takes half the time."""
         return sought.mean + sought.cross_times(self.train, self.alpha * self.observed)
 
-    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+    def moments(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and variances at each point, ``... x S x m x q``."""
         mean, cross = self.mean(sought)
         white = self.white(cross)

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from copy import copy, deepcopy
+from copy import copy
 from functools import partial
-from itertools import product
 from typing import Any, NamedTuple
 
 import torch
-from gpytorch.kernels import Kernel as AnyGPyTorchKernel
 from torch import Tensor
-from torch.func import functional_call
 
 from gpadjust.core.unknowns import LogNormal, Row, Values, standard_normal
 
@@ -22,7 +19,8 @@ Features = Callable[[Tensor], Tensor]
 
 RHO = LogNormal(0.001, 100.0)  # prior variance of a scaling's process
 DELTA = LogNormal(0.1, 1000.0)  # that of a process in squared units of the targets
-_LENGTH_FACTOR = 7.4
+LENGTH_FACTOR = 7.4
+STANDARD_DEVIATION = "standard deviation"  # of a process, in summaries
 
 
 class Kernel(ABC):
@@ -54,6 +52,15 @@ class Kernel(ABC):
     def of_term(self, outputscale: LogNormal) -> Kernel:
         """Return the kernel with the prior variance of a term if it has none; or itself."""
         return self
+
+    def in_user_units(self, name: str, numbers: Tensor, unit: float) -> tuple[str, Tensor]:
+        """Return the name and numbers of a parameter in summaries, by the unit of the process.
+
+        Here an ``outputscale``, a variance, becomes a standard deviation; others have no unit.
+        """
+        if not name.endswith("outputscale"):
+            return name, numbers
+        return name.replace("outputscale", STANDARD_DEVIATION), numbers.sqrt() * unit
 
     def variance(self, own: Values, x: Tensor) -> Tensor:
         """Return the prior variances, ``... x S x m x n`` (or 1 where all are equal)."""
@@ -114,14 +121,10 @@ def _matern_slope(p: int, e: Tensor) -> Tensor:
     return slope * (e < 0) if p == 0 else slope
 
 
-RBF = Profile("rbf", torch.exp, torch.exp, math.inf)
-"""The squared exponential kernel, exp(-r^2 / 2)."""
-MATERN12 = _matern(0)
-"""The exponential kernel, Matern with nu = 1/2."""
-MATERN32 = _matern(1)
-"""The Matern kernel with nu = 3/2."""
-MATERN52 = _matern(2)
-"""The Matern kernel with nu = 5/2."""
+RBF = Profile("rbf", torch.exp, torch.exp, math.inf)  # exp(-r^2 / 2)
+MATERN12 = _matern(0)  # nu = 1/2, the exponential kernel
+MATERN32 = _matern(1)  # nu = 3/2
+MATERN52 = _matern(2)  # nu = 5/2
 
 
 def exponents(z: Tensor, other: Tensor | None = None) -> Tensor:
@@ -147,7 +150,7 @@ class Stationary(Kernel):
         lengthscale: The prior of each lengthscale, in shares of d times the range of its input.
     """
 
-    lengthscale = LogNormal(1.0, _LENGTH_FACTOR)
+    lengthscale = LogNormal(1.0, LENGTH_FACTOR)
 
     def __init__(
         self, profile: Profile = RBF, outputscale: LogNormal | None = None,
@@ -263,207 +266,15 @@ class Stationary(Kernel):
             shape = (len(length), 1, int(degrees), number // 2)
             chi2 = standard_normal(shape, generator, length).square().sum(-2, keepdim=True)
             w = w * (degrees / chi2).sqrt()
-        return lambda x: _fourier(own, x, w)
+        return lambda x: fourier_features(own, x, w)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.profile.name})"
 
 
-def _fourier(own: Values, x: Tensor, w: Tensor) -> Tensor:
+def fourier_features(own: Values, x: Tensor, w: Tensor) -> Tensor:
     """Return sines and cosines of frequencies ``d x D/2``."""
     # sqrt(s / n) (sin a, cos a), a = w x / l, of n frequencies
     a = (x / own["lengthscale"].unsqueeze(-2)) @ w.to(x)
     size = (own["outputscale"] / w.shape[-1]).sqrt().unsqueeze(-1)
     return size * torch.cat([a.sin(), a.cos()], -1)
-
-
-class Fourier(Stationary):
-    r"""The kernel :math:`\varphi(x)^T \varphi(x')` of finitely many random Fourier features.
-
-    With it the process is a Bayesian linear model, ridge regression (Rahimi and Recht 2007).
-    """
-
-    def __init__(
-        self, num_inputs: int, num_features: int, seed: int = 0, outputscale: LogNormal = DELTA
-    ) -> None:
-        super().__init__(RBF, outputscale)
-        self.seed = seed
-        generator = torch.Generator().manual_seed(seed)
-        shape = (num_inputs, num_features // 2)
-        self.frequencies = torch.randn(shape, generator=generator, dtype=torch.float64)
-
-    def of_data(self, data: Any) -> Fourier:
-        """Return the kernel of as many inputs as an input transform makes."""
-        d = data.kernel_inputs(data.X[:1]).shape[-1]
-        if d == len(self.frequencies):
-            return self
-        return type(self)(d, 2 * self.frequencies.shape[-1], self.seed, self.outputscale)
-
-    def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
-        """Return the inner products of the features."""
-        phi = phi_other = _fourier(own, x, self.frequencies)
-        if other is not None:
-            phi_other = _fourier(own, other, self.frequencies)
-        return phi @ phi_other.mT
-
-    def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
-        """Return K and its derivatives in closed form."""
-        w = self.frequencies.to(x)
-        half = w.shape[-1]
-        z = x / own["lengthscale"].unsqueeze(-2)
-        a = z @ w
-        phi = torch.cat([a.sin(), a.cos()], -1) / math.sqrt(half)
-        k = phi @ phi.mT
-        scale = own["outputscale"].unsqueeze(-1)
-
-        def pull_back(D: Tensor) -> Values:
-            # df / da = cos(a) df / dsin - sin(a) df / dcos, and a = w x / l
-            by_phi = 2 * scale * D @ phi
-            by_angle = by_phi[..., :half] * phi[..., half:] - by_phi[..., half:] * phi[..., :half]
-            # da / dl = -w x / l^2
-            by_length = -((by_angle @ w.mT) * z).sum(-2) / own["lengthscale"]
-            return {"lengthscale": by_length, "outputscale": (D * k).sum((-1, -2)).unsqueeze(-1)}
-
-        return scale * k, pull_back
-
-    def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
-        """Return the kernel's own features; ``number`` is not used."""
-        return lambda x: _fourier(own, x, self.frequencies)
-
-
-class OfGPyTorch(Kernel):
-    """A GPyTorch kernel without batch shape, with its constraints and priors.
-
-    A parameter without a prior is known to a factor (or, if it may be negative, with a standard
-    deviation of 1) around its value in the kernel, in units of the targets; an ``outputscale``
-    without one has the prior of the term.
-    """
-
-    def __init__(self, kernel: AnyGPyTorchKernel, outputscale: LogNormal = DELTA) -> None:
-        if not isinstance(kernel, AnyGPyTorchKernel):
-            raise TypeError(
-                "Expected a kernel of gpadjust.core or GPyTorch, such as Stationary(MATERN52) or "
-                f"ScaleKernel(MaternKernel()); found {kernel!r}."
-            )
-        if kernel.batch_shape:
-            raise ValueError(
-                f"Expected a kernel without batch shape; found {tuple(kernel.batch_shape)}."
-            )
-        self.outputscale = outputscale
-        self.kernel = deepcopy(kernel).double()
-        self.kernel.requires_grad_(False).eval()
-        self._as_batch: bool | None = None
-
-    def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
-        """Return a row for each parameter that is learnt."""
-        priors = {}
-        for _, module, prior, closure, _ in self.kernel.named_priors():
-            for name, parameter in self.kernel.named_parameters():
-                with torch.enable_grad():  # a prior is of the parameter that its value depends on
-                    parameter.requires_grad_(True)
-                    if closure(module).requires_grad:
-                        priors[name] = prior
-                    parameter.requires_grad_(False)
-        rows = []
-        for name, raw, constraint in self.kernel.named_parameters_and_constraints():
-            value, factor, is_positive = raw, math.e, False
-            if constraint is not None:
-                value = constraint.transform(raw)
-                is_positive = bool((constraint.lower_bound >= 0).all())
-            if is_positive:
-                factor = _LENGTH_FACTOR
-            prior = priors.get(name)
-            density = prior and partial(_log_density, prior, raw.shape)
-            if prior is None and name.endswith("raw_outputscale"):
-                value = torch.full_like(value, self.outputscale.median)
-                factor = self.outputscale.factor
-            if is_positive:
-                value = value.clamp_min(1e-12).log()
-            location = value.reshape(-1).expand(num_outputs, -1)
-            rows.append(Row(name, location, math.log(factor), is_positive, log_density=density))
-        return rows
-
-    def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
-        """Return the kernel's covariances, a batch at once where the kernel can."""
-        lead = next((value.shape[:-1] for value in own.values()), torch.Size([1, 1]))
-        if self._as_batch is None:
-            self._as_batch = self._is_the_same_as_a_batch(own, x, lead)
-        if other is None:
-            other = x
-        evaluate = self._of_batch if self._as_batch else self._one_by_one
-        return evaluate(own, x, other, lead)
-
-    def _dense(self, kernel: AnyGPyTorchKernel, values: Values, x: Tensor, other: Tensor) -> Tensor:
-        """Return covariances of a kernel at values of its parameters."""
-        raw = {}
-        for name, old, constraint in self.kernel.named_parameters_and_constraints():
-            value = values[name].reshape((*values[name].shape[:-1], *old.shape))
-            if constraint is not None:
-                low, high = constraint.lower_bound.to(value), constraint.upper_bound.to(value)
-                value = value.maximum(low + 1e-12 * low.abs().nan_to_num(posinf=0.0))
-                value = value.minimum(high - 1e-12 * high.abs().nan_to_num(posinf=0.0))
-                value = constraint.inverse_transform(value)
-            raw[f"kernel.{name}"] = value
-        return functional_call(_Dense(kernel), raw, (x, other))
-
-    def _of_batch(self, own: Values, x: Tensor, other: Tensor, lead: torch.Size) -> Tensor:
-        kernel = deepcopy(self.kernel)
-        for module in kernel.modules():
-            if isinstance(module, AnyGPyTorchKernel):
-                module.batch_shape = lead
-        shape = torch.broadcast_shapes(lead, x.shape[:-2], other.shape[:-2])
-        x, other = (v.expand(*shape, *v.shape[-2:]) for v in (x, other))
-        return self._dense(kernel, own, x, other)
-
-    def _one_by_one(self, own: Values, x: Tensor, other: Tensor, lead: torch.Size) -> Tensor:
-        x, other = (v.expand(*v.shape[:-4], *lead, *v.shape[-2:]) for v in (x, other))
-        parts = []
-        for i, j in product(*map(range, lead)):
-            one = {name: value[i, j] for name, value in own.items()}
-            kernel = deepcopy(self.kernel)  # some cache what they have computed
-            parts.append(self._dense(kernel, one, x[..., i, j, :, :], other[..., i, j, :, :]))
-        return torch.stack(parts, -3).unflatten(-3, lead)
-
-    def _is_the_same_as_a_batch(self, own: Values, x: Tensor, lead: torch.Size) -> bool:
-        """Return whether evaluating a batch gives what each of its elements gives."""
-        few = {name: value.detach()[:2].repeat(2, 1, 1)[:2] for name, value in own.items()}
-        size = torch.Size([2, lead[1]])
-        x = x.detach().reshape(-1, *x.shape[-2:])[0, :5].reshape(1, 1, -1, x.shape[-1])
-        expected = self._one_by_one(few, x, x, size)
-        try:
-            batch = self._of_batch(few, x, x, size)
-        except Exception:
-            return False
-        return batch.shape == expected.shape and torch.allclose(batch, expected, rtol=1e-9)
-
-    def __repr__(self) -> str:
-        return repr(self.kernel).replace("\n", " ")
-
-
-class _Dense(torch.nn.Module):
-    """A kernel whose matrix is computed at the call, with the parameters of the call."""
-
-    def __init__(self, kernel: AnyGPyTorchKernel) -> None:
-        super().__init__()
-        self.kernel = kernel
-
-    def forward(self, x: Tensor, other: Tensor) -> Tensor:
-        return self.kernel(x, other).to_dense()
-
-
-def _log_density(prior: Any, shape: torch.Size, theta: Tensor) -> Tensor:
-    """Return the log density of numbers ``... x k`` by a prior of GPyTorch."""
-    value = theta.reshape(*theta.shape[:-1], *shape)
-    is_possible = prior.support.check(value)
-    log_prob = prior.log_prob(value.where(is_possible, torch.as_tensor(prior.mean).to(value)))
-    log_prob = log_prob.masked_fill(~is_possible, -math.inf)
-    return log_prob.reshape(*theta.shape[:-1], -1).sum(-1)
-
-
-def as_kernel(kernel: Any, outputscale: LogNormal = DELTA) -> Kernel:
-    """Return a kernel of this library, one of GPyTorch in a wrapper, or the default RBF."""
-    if kernel is None:
-        return Stationary(RBF, outputscale)
-    if isinstance(kernel, Kernel):
-        return kernel.of_term(outputscale)
-    return OfGPyTorch(kernel, outputscale)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from inspect import signature
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import gpytorch
 import torch
@@ -22,27 +22,20 @@ from gpytorch.priors import NormalPrior
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
+from gpadjust.core import gaussian
 from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
-from gpadjust.core.gaussian import (
-    Conditioning,
-    Marginals,
-    Prediction,
-    SumLikelihood,
-    add_noise,
-    sum_likelihood,
-)
-from gpadjust.core.kernels import DELTA, RHO, as_kernel
+from gpadjust.core.gaussian import Conditioning, Marginals, Prediction, SumLikelihood
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.summary import counted, summary, summary_html
-from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
+from gpadjust.core.terms import Places, Term, TermSum, WeightedSum, with_kernel
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import MeanView, NoiseView, OtherPriors, TermView, squeezed
 from gpadjust.display import Display
 from gpadjust.physics import Physics, PhysicsError, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.physics.unknown import NO_UNKNOWNS, Unknowns
+from gpadjust.physics.unknown import Unknowns
 from gpadjust.progress import tick
 
 Slopes = dict[str, list[Tensor]]
@@ -65,8 +58,7 @@ class Predictive(Model, FantasizeMixin, Display):
 
         Args:
             X: Inputs, ``... x q x d``.
-            observation_noise: If True, include observation noise; or its variances,
-                ``... x q x m``.
+            observation_noise: If True, with that noise; or its variances, ``... x q x m``.
 
         Returns:
             Mean and variance, ``... x q x m``: tensors, arrays or frames, as ``X``.
@@ -96,6 +88,22 @@ class Predictive(Model, FantasizeMixin, Display):
         """Return the distributions of Gaussian components ``... x S x q x m``."""
         return Marginals(means, variances)
 
+    def to(self, *args: Any, **options: Any) -> Self:
+        """Move the model to a device, with its data; a TypeError for a type but float64."""
+        kinds = {getattr(value, "dtype", value) for value in (*args, *options.values())}
+        wrong = [kind for kind in kinds - {torch.float64} if isinstance(kind, torch.dtype)]
+        if wrong:
+            raise TypeError(f"Expected a device, as models compute in float64; found {wrong[0]}.")
+        return super().to(*args, **options)
+
+    def float(self) -> Self:
+        """Raise a TypeError, as :meth:`to` does."""
+        return self.to(torch.float32)
+
+    def half(self) -> Self:
+        """Raise a TypeError, as :meth:`to` does."""
+        return self.to(torch.float16)
+
     def posterior_of(self, mixture: MixturePosterior, outputs: list[int] | slice) -> Any:
         """Return the posterior of some outputs of a mixture where the model is Gaussian."""
         return mixture
@@ -105,10 +113,7 @@ class Predictive(Model, FantasizeMixin, Display):
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
     ) -> Any:  # fmt: skip
-        """Return the joint posterior at ``X`` in BoTorch's form.
-
-        Its mean is ``... x q x m``, for ``X`` of ``... x q x d``.
-        """
+        """Return the joint posterior at ``... x q x d`` in BoTorch's form: ``... x q x m``."""
         self.eval()
         outputs: list[int] | slice = slice(None)
         if output_indices is not None:
@@ -184,8 +189,8 @@ class GP(gpytorch.models.GP, Predictive):
             raise _unknown_option(type(self), next(iter(others)))
         for name, option in {"noise": noise, "input_transform": input_transform}.items():
             if isinstance(option, type):
-                kind = option.__name__
-                raise TypeError(f"Expected {name} as an instance, {kind}(); found the class.")
+                expected = f"an instance, {option.__name__}()"
+                raise TypeError(f"Expected {name} as {expected}; found the class.")
         if outcome_transform is not None and not isinstance(outcome_transform, Standardize):
             raise ValueError(
                 "Expected outcome_transform=None or Standardize, which has no effect; found "
@@ -201,7 +206,7 @@ class GP(gpytorch.models.GP, Predictive):
         self.physics = [as_physics(function) for function in physics]
         for f_p in self.physics:
             f_p.check_names(self.data.input_names)
-        terms = [_with_kernel(term) for term in terms]
+        terms = [with_kernel(term) for term in terms]
         if type(self) is GP:
             settings = {"terms": terms, "noise": noise, "choices": choices}
             settings["input_transform"] = input_transform
@@ -212,10 +217,8 @@ class GP(gpytorch.models.GP, Predictive):
         terms = [t._replace(kernel=t.kernel and t.kernel.of_data(self.data)) for t in terms]
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
-        unknowns = [f_p.unknowns for f_p in self.physics] or [NO_UNKNOWNS]
-        self._unknowns = unknowns[0]
-        if len(unknowns) > 1:
-            self._unknowns = Unknowns.together(unknowns)
+        unknowns = [f_p.unknowns for f_p in self.physics]
+        self._unknowns = unknowns[0] if len(unknowns) == 1 else Unknowns.together(unknowns)
         # f_p at the training inputs, and the unit of the targets by it.
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
@@ -230,7 +233,7 @@ class GP(gpytorch.models.GP, Predictive):
         if self.data.Yvar is not None:
             known_noise = KnownNoise(self.noise_in_units(Y, self.data.Yvar))
             noise = known_noise if noise is None else noise.with_known(known_noise)
-        self.noise = (noise or Noise()).of_terms(self.term_sum)
+        self.noise = (noise or Noise()).of_data(self.data, self.term_sum)
         # The table of all unknown numbers, and u.
         rows = self.term_sum.rows(self.data.kernel_inputs(X), m) + self.noise.rows(Y)
         rows += [Row(f"physics.{n}", Y.new_zeros(1), is_shared=True) for n in self._unknowns]
@@ -330,9 +333,7 @@ class GP(gpytorch.models.GP, Predictive):
     ) -> tuple[Tensor, Tensor]:
         """Return the same of few draws, with f_p and its derivatives if it has parameters."""
         values, y = self.table.values(u), self.targets()
-        places = self.places(self.data.X, values, with_physics=f is None)
-        if f is not None:
-            places = places._replace(f=f)
+        places = self.places(self.data.X, values, f)
         total = self.term_sum.evaluate(values, places)
         noise = self.noise.variance(values, places, True)
         observed = ~y.isnan()
@@ -352,35 +353,27 @@ class GP(gpytorch.models.GP, Predictive):
         return value.masked_fill(fails, -torch.inf), gradient.masked_fill(fails.unsqueeze(-1), 0.0)
 
     def prior_mean(self, u: Tensor) -> Tensor:
-        """Return the mean of the targets at coordinates ``S x B x P``, ``S x (m n)``, in units.
-
-        It is NaN where f_p fails, and 0 of missing targets.
-        """
-        total, _ = self._prior(u)
-        missing = self.targets().isnan()
-        return total.mean.expand(len(u), *missing.shape).masked_fill(missing, 0.0).flatten(1)
+        """Return the mean of the targets at u, ``S x (m n)``: NaN where f_p fails, 0 if missing."""
+        total, _, y = self._with_failures(u)
+        return total.mean.expand(len(u), *y.shape[1:]).masked_fill(y.isnan(), 0.0).flatten(1)
 
     def precision_times(self, u: Tensor, v: Tensor) -> Tensor:
         """Return the inverse covariance of the targets at ``S x B x P`` times ``S x (m n)``."""
-        total, noise = self._prior(u)
-        missing = self.targets().isnan()
-        v = v.reshape(len(u), *missing.shape)
-        return self.sum_likelihood(total, v, noise, ~missing, True).by_mean.flatten(1)
+        total, noise, y = self._with_failures(u)
+        v = v.reshape(len(u), *y.shape[1:])
+        return self.sum_likelihood(total, v, noise, ~y[0].isnan(), True).by_mean.flatten(1)
 
-    def _prior(self, u: Tensor) -> tuple[WeightedSum, Tensor]:
-        """Return the sum at the training inputs, NaN where f_p fails, and the noise's variances."""
+    def _with_failures(self, u: Tensor) -> tuple[WeightedSum, Tensor, Tensor]:
+        """Return what :meth:`_observed` does at coordinates, NaN where f_p fails."""
         values = self.table.values(u)
-        places = self.places(self.data.X, values, with_physics=False)
-        places = places._replace(f=self._physics_with_slopes(values, False)[0])
-        noise = self.noise.variance(values, places, True)
-        return self.term_sum.evaluate(values, places), noise
+        return self._observed(values, self._physics_with_slopes(values, False)[0])
 
     def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
         with_gradient: bool,
     ) -> SumLikelihood:  # fmt: skip
         """Return the log likelihood of residuals ``S x m x n``; a subclass may bound it."""
-        return sum_likelihood(train, residual, noise, observed, with_gradient)
+        return gaussian.sum_likelihood(train, residual, noise, observed, with_gradient)
 
     def conditioned(
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Any = None
@@ -520,7 +513,9 @@ class GP(gpytorch.models.GP, Predictive):
         X = self.data.X
         names = [*self._unknowns]
         z = torch.cat([values[f"physics.{name}"] for name in names], -1)  # S x p
-        p = len(names) * with_slopes
+        p = 0
+        if with_slopes:
+            p = len(names)
         steps = _STEP * torch.eye(p, len(names)).to(z).unsqueeze(1)
         # Central differences, by one call: (1 + 2 p) x S x p.
         shifted = torch.cat([z.unsqueeze(0), z + steps, z - steps])
@@ -540,13 +535,12 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the inputs of kernels at ``... x n x d``; a kind of data may add to them."""
         return self.data.kernel_inputs(X)
 
-    def places(self, X: Tensor, values: Values, with_physics: bool = True) -> Places:
-        """Return the inputs of kernels, physics and noise at ``... x n x d``."""
+    def places(self, X: Tensor, values: Values, f: Sequence[Tensor] | None = None) -> Places:
+        """Return the inputs of kernels and noise at ``... x n x d``, and f_p unless it is given."""
         x = self.kernel_inputs(X).unsqueeze(-3).unsqueeze(-3)
-        f: Sequence[Tensor] = []
         if self._f_train and not self._unknowns and X is self.data.X:
             f = self._f_train
-        elif with_physics:
+        elif f is None:
             f = self._physics_at(X.unsqueeze(-3), values)
         return Places(x, f, X.unsqueeze(-3).unsqueeze(-3))
 
@@ -570,9 +564,11 @@ class GP(gpytorch.models.GP, Predictive):
             self._cached = (self.u.detach().clone(), conditioning)
         return self._cached[1]
 
-    def _observed(self, values: Values) -> tuple[WeightedSum, Tensor, Tensor]:
+    def _observed(
+        self, values: Values, f: Sequence[Tensor] | None = None
+    ) -> tuple[WeightedSum, Tensor, Tensor]:
         """Return the function at the training inputs, the variances of the noise, and targets."""
-        places = self.places(self.data.X, values)
+        places = self.places(self.data.X, values, f)
         noise = self.noise.variance(values, places, True)
         return self.term_sum.evaluate(values, places), noise, self.targets().unsqueeze(-3)
 
@@ -597,7 +593,7 @@ class GP(gpytorch.models.GP, Predictive):
         with self._graph_for(X):
             values = conditioning.train.values
             f = self.term_sum.evaluate(values, self.places(X, values))
-            mean, variance = conditioning.marginals(f)
+            mean, variance = conditioning.moments(f)
             if observation_noise is not False:
                 variance = variance + self._noise_at(X, observation_noise)
             variance = variance * self.unit.square()
@@ -612,7 +608,7 @@ class GP(gpytorch.models.GP, Predictive):
         with self._graph_for(X):
             mean, K = conditioning.joint(self.evaluate(X, conditioning.train.values))
             if observation_noise is not False:
-                K = add_noise(K, self._noise_at(X, observation_noise))
+                K = gaussian.add_noise(K, self._noise_at(X, observation_noise))
             mean, K = mean * self.unit, K * self.unit.square().unsqueeze(-1)
             return MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :])
 
@@ -629,7 +625,7 @@ class GP(gpytorch.models.GP, Predictive):
         unit = self.unit if has_unit else torch.ones_like(self.unit)
         with self._graph_for(X):
             values = conditioning.train.values
-            places = self.places(X, values, with_physics=False)
+            places = self.places(X, values, f=())
             mean, K = conditioning.joint(self.term_sum.term(name, values, places))
             return MixturePosterior(mean * unit, K * unit.square().unsqueeze(-1))
 
@@ -689,11 +685,9 @@ class GP(gpytorch.models.GP, Predictive):
         is_right = shape[-2:-1] in ((1,), (q,)) and shape[-1] in (1, m)
         if isinstance(noise, Tensor) and is_right and (noise >= 0).all():
             return noise.expand(*shape[:-2], q, m)
-        if not isinstance(noise, Tensor):
-            shape = noise
         raise ValueError(
             f"Expected noise as True, False or variances ... x {q} x {m}, not negative or NaN; "
-            f"found {shape!r}. Known noise belongs to the model, in train_Yvar."
+            f"found {shape or noise!r}. Known noise belongs to the model, in train_Yvar."
         )
 
     # Other data, outputs and draws.
@@ -736,6 +730,11 @@ class GP(gpytorch.models.GP, Predictive):
             conditioning = new.conditioned(*new._observed(values), old)
         new._cached = (self.u.detach().clone(), conditioning)
         return new.eval()
+
+    def set_train_data(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise an error: the data of a model stay."""
+        way_out = "build another one, or take model.condition_on_observations(X, Y)"
+        raise NotImplementedError(f"The data of a model stay: {way_out}.")
 
     def get_fantasy_model(self, inputs: Any, targets: Tensor, **options: Any) -> Self:
         """Condition on targets ``... x (m) x k``, as GPyTorch's lists of models do."""
@@ -898,8 +897,7 @@ class GP(gpytorch.models.GP, Predictive):
 @DrawMatheronPaths.register(Predictive)  # type: ignore[untyped-decorator]
 def _draw_matheron_paths(model: Any, *, sample_shape: Size, **_: Any) -> Paths:
     """Draw functions for BoTorch's ``draw_matheron_paths``, by the model's own features."""
-    functions = model.sample_functions(max(1, sample_shape.numel()))
-    return Paths(functions, sample_shape)
+    return Paths(model.sample_functions(max(1, sample_shape.numel())), sample_shape)
 
 
 def _unknown_option(structure: type[GP], name: str) -> TypeError:
@@ -915,23 +913,11 @@ def _unknown_option(structure: type[GP], name: str) -> TypeError:
     )
 
 
-def _with_kernel(term: Any) -> Term:
-    """Return a term of a kernel of this library or of GPyTorch."""
-    if not isinstance(term, Term):
-        raise TypeError(f"Expected terms as a list of Term(name, kernel, ...); found {term!r}.")
-    if term.kernel is None:
-        return term
-    kernel = as_kernel(term.kernel, DELTA if term.physics is None else RHO)
-    if not kernel.has_constant:
-        term = term._replace(constant=None)
-    return term._replace(kernel=kernel)
-
-
 def _coordinates(model: GP) -> Tensor:
     """Return the coordinates of a single draw, ``m x P``, for their prior."""
     u, m = model.u[0], model.num_outputs
     if len(u) == m:
-        return u if m > 1 else u[0]
+        return u.squeeze(0)
     return u.expand(m, -1) / m**0.5  # each output adds its share of -u^2 / 2
 
 

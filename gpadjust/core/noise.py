@@ -9,7 +9,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from gpadjust.core.data import appended
+from gpadjust.core.data import Data, appended
 from gpadjust.core.terms import Places, TermSum
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
@@ -55,8 +55,11 @@ class Noise:
         """Mask ``n x m`` of the training targets that are outliers; None without a search."""
         return None
 
-    def of_terms(self, terms: TermSum) -> Self:
-        """Return the noise for a model of these terms; itself by default."""
+    def of_data(self, data: Data, terms: TermSum) -> Self:
+        """Return the noise for a model's data and terms, as with priors by them; itself here.
+
+        Targets are in the unit ``terms.unit``, ``m x 1``, f_p at the training inputs, ``terms.f``.
+        """
         return self
 
     def shares(self, places: Places) -> Tensor | None:
@@ -116,9 +119,7 @@ class Noise:
 
     def with_known(self, known: KnownNoise) -> Noise:
         """Return the noise of targets with known variances; a ValueError if it learns them."""
-        raise ValueError(
-            f"Expected train_Yvar or a noise that learns variances; found both, {self}."
-        )
+        raise ValueError(f"Expected train_Yvar or a noise of learnt variances; found both, {self}.")
 
     def of_outputs(self, outputs: Sequence[int]) -> Self:
         """Return the noise of some outputs."""

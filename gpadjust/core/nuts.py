@@ -29,9 +29,6 @@ def nuts(model: GP, draws: Tensor, number: int, seed: int) -> tuple[Tensor, floa
     each trajectory of NUTS come jumps: Metropolis steps whose proposals are points around these
     draws and, after warm-up, those of all chains, or from the prior (an independence sampler,
     Tierney 1994). R-hat compares halves of the chains (Gelman et al. 2013).
-
-    Raises:
-        ImportError: Without Pyro, ``pip install "gpadjust[pyro]"``.
     """
     try:
         from pyro.infer import NUTS  # here alone, as it takes a second

@@ -37,14 +37,6 @@ class _MultitaskNormal(MultitaskMultivariateNormal, _Normal):
     """The same of several outputs."""
 
 
-def _block_diagonal(K: Tensor) -> Tensor:
-    """Return ``... x m q x m q`` of covariances ``... x m x q x q``."""
-    if K.shape[-3] == 1:
-        return K.squeeze(-3)
-    # ... x m x q x m x q
-    return torch.diag_embed(K.movedim(-3, -1), dim1=-4, dim2=-2).flatten(-2).flatten(-3, -2)
-
-
 class MixturePosterior(GPyTorchPosterior):
     """A mixture of ``S`` equally likely Gaussians, each of independent outputs.
 
@@ -62,8 +54,10 @@ class MixturePosterior(GPyTorchPosterior):
         center = mean.mean(-3)
         away = (mean - center.unsqueeze(-3)).flatten(-2)  # ... x S x m q
         between = away.mT @ away / away.shape[-2]
+        # Blocks of the outputs, ... x m x q x m x q, on the diagonal of ... x m q x m q.
+        K = torch.diag_embed(covariance.mean(-4).movedim(-3, -1), dim1=-4, dim2=-2)
         # Without a factor until one is read.
-        lazy = to_linear_operator(_block_diagonal(covariance.mean(-4)) + between)
+        lazy = to_linear_operator(K.flatten(-2).flatten(-3, -2) + between)
         if center.shape[-2] == 1:
             super().__init__(_Normal(center.squeeze(-2), lazy))
         else:
@@ -74,7 +68,10 @@ class MixturePosterior(GPyTorchPosterior):
         """``... x q m``, and of several components one more, which picks the component."""
         mean, _ = self.gaussians
         S, m, q = mean.shape[-3:]
-        return Size([*mean.shape[:-3], q * m + (S > 1)])
+        size = q * m
+        if S > 1:
+            size += 1
+        return Size([*mean.shape[:-3], size])
 
     @property
     def marginals(self) -> Marginals:
@@ -123,9 +120,8 @@ class MixturePosterior(GPyTorchPosterior):
 
     def quantile(self, value: Tensor) -> Tensor:
         """Return quantiles ``... x q x m`` of the mixture, with several levels in front."""
-        levels = value.flatten().tolist()
-        quantiles = [self.marginals.quantile(level) for level in levels]
-        return torch.stack(quantiles) if value.numel() > 1 else quantiles[0]
+        quantiles = [self.marginals.quantile(level) for level in value.flatten().tolist()]
+        return torch.stack(quantiles).squeeze(0)
 
     def density(self, value: Tensor) -> Tensor:
         """Return the density of each output at each point, at values ``... x q x m``."""

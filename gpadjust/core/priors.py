@@ -46,6 +46,5 @@ def priors(model: Any) -> Priors:
     frame.prior = [number.draws for number in numbers.values()]
     frame.posterior = None
     if model.is_fitted:
-        after = numbers_of(model, model.draws)
-        frame.posterior = [after[key].draws for key in numbers]
+        frame.posterior = [number.draws for number in numbers_of(model, model.draws).values()]
     return frame

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from scipy.optimize import minimize
@@ -12,13 +13,8 @@ from torch import Tensor
 
 from gpadjust.core.unknowns import standard_normal
 
-
-class LogLikelihood(Protocol):
-    """The log likelihood of coordinates of ``B`` independent problems."""
-
-    def __call__(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
-        """Return values ``N x B`` at ``N x B x P``, and gradients (zeros if not asked for)."""
-
+LogLikelihood = Callable[..., tuple[Tensor, Tensor]]
+"""Of coordinates ``N x B x P`` and ``with_gradient``: values ``N x B`` of problems, and slopes."""
 
 GROUPS = 2  # of draws that are resampled apart; their difference is the error
 _SHARE = 0.5  # of the resulting draws, that count after each step of the power
@@ -103,13 +99,14 @@ def sample(
     u = begin.mean + (begin.root @ points.unsqueeze(-1)).squeeze(-1)
     value, slope = ratio(u, False)
     power = like.new_zeros(shape[0])
+    least = _SHARE * number if with_moves else 0.0  # draws that count
     evidence = like.new_zeros(GROUPS, shape[0])
     length = torch.full_like(power, _FIRST_LENGTH)
     problems = torch.arange(shape[0], device=like.device)
     effective = None
     while True:
         # The highest power at which enough draws count.
-        step = _step(value, power, _SHARE * number * with_moves)
+        step = _step(value, power, least)
         logs = (step * value).nan_to_num(nan=-math.inf)
         halves = logs.reshape(GROUPS, -1, shape[0])
         # The evidence is the product of the mean weights.
@@ -120,15 +117,16 @@ def sample(
         if effective is None:
             effective = weights.square().sum(0).reciprocal()
             with_moves = with_moves and (start is None or bool((effective < number).any()))
-        is_done = bool((power >= 1).all()) or not with_moves
         # Resample, and move.
         root = _root(u, weights, start)
         chosen = _resampled(halves, number // GROUPS, generator)
         u, value, slope = (part[chosen, problems] for part in (u, value, slope))
-        if is_first and with_moves:
+        if not with_moves:
+            return Draws(u, evidence, effective)
+        if is_first:
             value, slope = ratio(u)
-        moves = _LAST_MOVES if is_done else _MOVES
-        for _ in range(moves * with_moves):
+        is_done = bool((power >= 1).all())
+        for _ in range(_LAST_MOVES if is_done else _MOVES):
             here = (u, value, slope)
             u, value, slope, rate = _move(ratio, begin, here, power, root, length, generator)
             length = length * (rate - _ACCEPTED).exp()
@@ -250,9 +248,11 @@ def maximise(
         return -float(density.sum()), (point - slope).nan_to_num().flatten().cpu().numpy()
 
     options: dict[str, float] = {"maxiter": most}
+    searches = _SEARCHES
     if not is_precise:
+        searches = 1
         options["ftol"] = 1e-5
-    for _ in range(max(1, _SEARCHES * is_precise)):
+    for _ in range(searches):
         before = float(top.nan_to_num(neginf=-1e10).sum())
         start = best.flatten().cpu().numpy()
         minimize(negative, start, jac=True, method="L-BFGS-B", options=options)
@@ -287,21 +287,31 @@ def around_mode(
     root = _whitening(hessian, torch.eye(p).to(mode).expand_as(hessian), is_precise)
     # log Z = log L(mode) - |mode|^2 / 2 + log |root|
     evidence = value[0] - 0.5 * mode.square().sum(-1) + torch.linalg.slogdet(root).logabsdet
-    for _ in range(_REFINED * is_precise):
+    if is_precise:
+        mode, root, evidence = _refined(log_likelihood, mode, root, evidence)
+    return Normal(mode, lower_root(WIDER * root)), evidence
+
+
+def _refined(
+    log_likelihood: LogLikelihood, mode: Tensor, root: Tensor, evidence: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a better mode, a better root of the covariance, and the log evidence by these."""
+    eye = torch.eye(mode.shape[-1]).to(mode)
+    moves = _STEP * eye.unsqueeze(1).expand(-1, len(mode), -1)  # along the axes of the posterior
+    here = torch.zeros_like(mode).unsqueeze(0)
+    for _ in range(_REFINED):
         before = evidence
-        white = partial(white_density, log_likelihood, mode, root)
-        step = maximise(white, torch.zeros_like(here), True)[0]
+        step = maximise(partial(white_density, log_likelihood, mode, root), here, True)[0]
         mode = mode + (root @ step.unsqueeze(-1))[..., 0]
-        moves = _STEP * torch.eye(p).to(mode).unsqueeze(1).expand(-1, len(mode), -1)
         white = partial(white_density, log_likelihood, mode, root)
-        value, slope = white(torch.cat([torch.zeros_like(here), moves, -moves]))
+        value, slope = white(torch.cat([here, moves, -moves]))
         up, down = (slope[1:] - torch.cat([moves, -moves])).chunk(2)
         rows = (down - up).nan_to_num().movedim(0, -2) / (2 * _STEP)
-        root = _whitening(rows - root.mT @ root, root, is_precise)
+        root = _whitening(rows - root.mT @ root, root, is_precise=True)
         evidence = value[0] + torch.linalg.slogdet(root).logabsdet
         if ((evidence - before).abs() < _SETTLED).all():
             break
-    return Normal(mode, lower_root(WIDER * root)), evidence
+    return mode, root, evidence
 
 
 def lower_root(root: Tensor) -> Tensor:

@@ -23,12 +23,15 @@ from gpadjust.core.kernels import Kernel
 from gpadjust.core.model import GP
 from gpadjust.core.noise import Noise
 from gpadjust.core.stacked import StackedGP
+from gpadjust.core.terms import Term
+from gpadjust.core.unknowns import Choice, LogNormal
 from gpadjust.physics import PhysicsError
 from gpadjust.physics.import_path import import_path, is_formula, physics_from_path
 
 _FORMAT = 5
 _COMPARED = 100  # rows whose covariances with all others distinguish kernels
-_PARTS = (Kernel, Noise, InputTransform)  # of a model, that a file may contain
+_PARTS = (Kernel, Noise, InputTransform)  # of a model, that a file may contain by settings
+_TUPLES = (Term, LogNormal, Choice)  # by fields
 
 
 class Saved(NamedTuple):
@@ -42,8 +45,8 @@ class Saved(NamedTuple):
 def save(model: GP | StackedGP, path: str | Path) -> Saved:
     """Save a model: its class, settings, data and draws, and its physics by the import path.
 
-    Arguments that are not plain values (kernels, noises and transforms without ``settings``,
-    lambdas, and the terms of a plain ``GP``) are to be passed to :func:`load`. The file is written
+    Arguments that are not plain values (kernels, noises and transforms without ``settings``, lists
+    of terms with such kernels, and lambdas) are to be passed to :func:`load`. The file is written
     under a fresh name and renamed, so that it is complete.
 
     Args:
@@ -74,7 +77,7 @@ def save(model: GP | StackedGP, path: str | Path) -> Saved:
     if not isinstance(model, GP | StackedGP):
         raise TypeError(
             f"Expected a model of gpadjust.core; found {type(model).__name__}. Of a comparison "
-            "save comparison.recommended."
+            "save comparison.recommended, of a list each of model.models."
         )
     path = Path(path)
     if path.is_dir() or not path.parent.is_dir():
@@ -143,9 +146,7 @@ def _content(model: GP) -> dict[str, Any]:
     """Return the content of the file of a model."""
     data, n = model.data, model.rows_of_fit
     if model.batch_shape or model._outputs is not None or n > len(data.Y):
-        raise ValueError(
-            "Expected a model of one data set and all its outputs, not fantasies or a part of it."
-        )
+        raise ValueError("Expected one data set with all outputs, not fantasies or a part of it.")
     parameters = signature(type(model)).parameters.values()
     takes_physics = any(p.name == "physics" or p.kind is p.VAR_KEYWORD for p in parameters)
     paths = [import_path(f_p) for f_p in model.physics if takes_physics]
@@ -154,12 +155,15 @@ def _content(model: GP) -> dict[str, Any]:
     settings |= {name: v for name, v in learnt.items() if settings.get(name) is not None}
     settings = {name: _packed(value) for name, value in settings.items()}
     missing = [name for name, value in settings.items() if not _is_plain(value)]
+    settings = {name: value for name, value in settings.items() if name not in missing}
+    if None in paths:
+        missing.append("physics")
     scalings = [term.name for term in model.terms if term.physics is not None]
     is_mapping = type(model) is not GP and all(name.startswith("rho_") for name in scalings)
     return {
         "class": _path_of(type(model)),
-        "settings": {name: value for name, value in settings.items() if name not in missing},
-        "missing": missing + ["physics"] * (None in paths),
+        "settings": settings,
+        "missing": missing,
         "physics": paths,
         "physics_names": [name.removeprefix("rho_") for name in scalings if is_mapping],
         "rows_of_fit": n,
@@ -194,19 +198,31 @@ def _class_of(path: str, base: Any) -> Any:
 
 
 def _packed(value: Any) -> Any:
-    """Return a noise, kernel or transform as its class and settings, if it has any."""
-    if not isinstance(value, _PARTS) or not hasattr(value, "settings"):
+    """Return a value with its parts as their classes and settings, if they have any."""
+    if type(value) in (list, tuple):
+        return type(value)(_packed(item) for item in value)
+    if isinstance(value, Mapping):
+        return {name: _packed(item) for name, item in value.items()}
+    settings = None
+    if isinstance(value, _TUPLES):
+        settings = value._asdict()
+    elif isinstance(value, _PARTS):
+        settings = getattr(value, "settings", None)
+    if settings is None:
         return value
-    settings = {name: _packed(setting) for name, setting in value.settings.items()}
-    return {"class": _path_of(type(value)), "settings": settings}
+    return {"class": _path_of(type(value)), "settings": _packed(settings)}
 
 
 def _unpacked(value: Any) -> Any:
     """Return the reverse of :func:`_packed`."""
-    if not isinstance(value, dict) or value.keys() != {"class", "settings"}:
+    if isinstance(value, list | tuple):
+        return type(value)(_unpacked(item) for item in value)
+    if not isinstance(value, dict):
         return value
-    settings = {name: _unpacked(setting) for name, setting in value["settings"].items()}
-    return _class_of(value["class"], _PARTS)(**settings)
+    items = {name: _unpacked(item) for name, item in value.items()}
+    if items.keys() != {"class", "settings"}:
+        return items
+    return _class_of(items["class"], (*_PARTS, *_TUPLES))(**items["settings"])
 
 
 def _is_plain(value: Any) -> bool:
@@ -320,8 +336,7 @@ def _physics(content: dict[str, Any], trusted: bool) -> Any:
     parts = [physics_from_path(path) for path in content["physics"]]
     if content["physics_names"]:
         return dict(zip(content["physics_names"], parts, strict=True))
-    is_list = len(parts) > 1 or content["class"] == _path_of(GP)
-    return parts if is_list else parts[0]
+    return parts if len(parts) > 1 or content["class"] == _path_of(GP) else parts[0]
 
 
 def _call(names: Any) -> str:

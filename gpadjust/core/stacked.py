@@ -13,7 +13,7 @@ from torch.quasirandom import SobolEngine
 
 from gpadjust.checks import checked_whole
 from gpadjust.core.data import ArrayLike, Data
-from gpadjust.core.gaussian import DRAWS, Marginals
+from gpadjust.core.gaussian import DRAWS
 from gpadjust.core.model import GP, Predictive
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.display import html_table
@@ -50,10 +50,9 @@ class Wrapper(Predictive):
         """The sign of the models' posteriors for BoTorch's lists of models, if they have one."""
         return self.models[0].outcome_transform
 
-    def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
+    def marginals_of(self, means: Tensor, variances: Tensor) -> Any:
         """Return the distributions of Gaussian components, as the models do."""
-        marginals: Marginals = self.models[0].marginals_of(means, variances)
-        return marginals
+        return self.models[0].marginals_of(means, variances)
 
     def posterior_of(self, mixture: MixturePosterior, outputs: list[int] | slice) -> Any:
         """Return the posterior of a mixture where the models are Gaussian, as they do."""
@@ -135,9 +134,8 @@ class StackedGP(Wrapper):
         densities = [model.left_out().log_density(model.data.Y) for model in models.values()]
         scores = torch.stack(densities).nan_to_num()  # K x n x m; 0 where one is missing
         weights = torch.full_like(scores[:, 0], 1 / len(models))
-        for _ in range(
-            _ROUNDS
-        ):  # expectation maximisation: w_k <- mean_i w_k p_ki / sum_l w_l p_li
+        # Expectation maximisation: w_k <- mean_i w_k p_ki / sum_l w_l p_li.
+        for _ in range(_ROUNDS):
             weights = (scores + weights.log().unsqueeze(1)).softmax(0).mean(1)
         return cls(models, weights, num_components)
 

@@ -6,11 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gpadjust.core.data import ArrayLike, names_of
-from gpadjust.core.kernels import DELTA, RHO, Fourier, as_kernel
+from gpadjust.core.fourier import Fourier
+from gpadjust.core.kernels import DELTA, RHO
 from gpadjust.core.model import GP
-from gpadjust.core.terms import Term
+from gpadjust.core.terms import Term, as_kernel
 from gpadjust.core.unknowns import Choice, LogNormal
 
+Constants = bool | Mapping[str, LogNormal]
 RHO_CONSTANT = LogNormal(0.01, 100.0)  # prior variance of a constant in rho, or of rho alone
 DELTA_CONSTANT = LogNormal(0.3, 1000.0)  # that in delta, in squared units of the targets
 
@@ -68,7 +70,7 @@ class CKA(GP):
         settings = options | {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
-            "constants": _plain(constants), "nested": nested, "extra_terms": [*extra_terms],
+            "constants": constants, "nested": nested, "extra_terms": [*extra_terms],
         }  # fmt: skip
         rhos, functions = _scalings(physics, rho_mean)
         kernel = as_kernel(rho_covar_module, RHO)
@@ -129,7 +131,7 @@ class PhysicsMeanGP(GP):
         physics: Any, covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True,
         **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
+        settings = options | {"covar_module": covar_module, "constants": constants}
         rhos, functions = _scalings(physics)
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[*rhos, _delta(covar_module, constants)],
@@ -149,7 +151,7 @@ class ScaleGP(GP):
         physics: Any, covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True,
         **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
+        settings = options | {"covar_module": covar_module, "constants": constants}
         constant = _constant(constants, "rho", RHO_CONSTANT)
         rho = Term("rho", as_kernel(covar_module, RHO_CONSTANT), 1.0, constant, 0)
         super().__init__(
@@ -168,7 +170,7 @@ class ZeroMeanGP(GP):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True, **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
+        settings = options | {"covar_module": covar_module, "constants": constants}
         f = _delta(covar_module, constants, "f")
         super().__init__(train_X, train_Y, train_Yvar, terms=[f], settings=settings, **options)
 
@@ -215,25 +217,15 @@ def _scalings(physics: Any, means: Any = None) -> tuple[list[Term], list[Any]]:
     return [Term(names[i], mean=float(means[i]), physics=i) for i in range(number)], functions
 
 
-def _constant(
-    constants: bool | Mapping[str, LogNormal], name: str, prior: LogNormal
-) -> LogNormal | None:
+def _constant(constants: Constants, name: str, prior: LogNormal) -> LogNormal | None:
     """Return the prior of a term's constant, None without one."""
     if isinstance(constants, Mapping):
         return LogNormal(*constants.get(name, prior))
     return prior if constants else None
 
 
-def _plain(constants: bool | Mapping[str, LogNormal]) -> Any:
-    """Return constants as values of a file."""
-    if isinstance(constants, Mapping):
-        return {name: tuple(prior) for name, prior in constants.items()}
-    return constants
-
-
-def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "delta") -> Term:
-    constant = _constant(constants, name, DELTA_CONSTANT)
-    return Term(name, as_kernel(kernel, DELTA), constant=constant)
+def _delta(kernel: Any, constants: Constants, name: str = "delta") -> Term:
+    return Term(name, as_kernel(kernel, DELTA), 0.0, _constant(constants, name, DELTA_CONSTANT))
 
 
 def _nested(rho: str, extra_terms: Sequence[Term], physics: Any) -> list[Choice]:

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gpadjust.core.kernels import STANDARD_DEVIATION as _SD
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Values
 from gpadjust.display import html_table
 
-_SD = "standard deviation"
 _MEANINGS = {
     "lengthscale": "distance over which {} changes",
     _SD: "size of the changes of {}",
@@ -41,7 +41,8 @@ def summary_html(model: Any) -> str:
 def _lines(model: Any) -> list[str]:
     """Return the kind and size of the model, and the numbers of each output."""
     values, X = model.table.values(model.draws), model.data.X
-    variance = model.noise.variance(values, model.places(X, values, model.noise.has_shares), True)
+    f = None if model.noise.has_shares else ()
+    variance = model.noise.variance(values, model.places(X, values, f), True)
     parts = [counted(model)]
     if not model.is_fitted:
         parts.append("not fitted")
@@ -65,7 +66,8 @@ def counted(model: Any) -> str:
     """Return the sizes of a model, such as "8 points, 1 input, 1 output, 16 draws"."""
     n, d = model.data.X.shape[-2:]
     counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
-    return ", ".join(f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items())
+    nouns = [noun if count == 1 else f"{noun}s" for noun, count in counts.items()]
+    return ", ".join(f"{count} {noun}" for noun, count in zip(nouns, counts.values(), strict=True))
 
 
 def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:
@@ -101,11 +103,11 @@ def numbers_of_term(model: Any, term: Term, values: Values, j: int) -> list[Numb
     """Return the numbers of a term of an output, at values ``N x m x k``."""
     unit = float(model.unit[j]) if term.physics is None else 1.0  # a scaling has no unit
     numbers = []
+    kernel: Any = term.kernel
     start = f"{term.name}.kernel."
     for key in (key for key in values if key.startswith(start)):
-        draws, name = values[key][:, j], key.removeprefix(start).replace("raw_", "")
-        if name.endswith("outputscale"):
-            draws, name = draws.sqrt() * unit, name.replace("outputscale", _SD)
+        name = key.removeprefix(start).replace("raw_", "")
+        name, draws = kernel.in_user_units(name, values[key][:, j], unit)
         meaning = _MEANINGS.get(name, f"a number of the kernel of {term.name}").format(term.name)
         labels = _labels(model, term, name, draws.shape[-1])
         for label, column in zip(labels, draws.unbind(-1), strict=True):
@@ -130,7 +132,9 @@ def numbers_of(model: Any, u: Tensor) -> dict[tuple[str, str], Number]:
     numbers = {}
     parameters = model.physics_parameters_at(u)
     for i, (name, unknown) in enumerate(parameters.unknowns.items()):
-        meaning = "a parameter of the physics" + (unknown.unit and f", in {unknown.unit}")
+        meaning = "a parameter of the physics"
+        if unknown.unit:
+            meaning += f", in {unknown.unit}"
         numbers["", name] = Number(name, parameters.draws[:, i], meaning)
     noise = model.noise.variance(values, model.places(model.data.X, values), True)
     for j, output in enumerate(model.data.output_names):
@@ -147,6 +151,9 @@ def numbers_of(model: Any, u: Tensor) -> dict[tuple[str, str], Number]:
 
 def _labels(model: Any, term: Term, name: str, number: int) -> list[str]:
     """Return labels of a kernel's numbers: the inputs, if it has a lengthscale of each."""
+    labels = [""] if number == 1 else [f" {i + 1}" for i in range(number)]
+    if not name.endswith("lengthscale"):
+        return labels
     names, transform, after = getattr(term.kernel, "input_names", None), model.data.transform, ""
     if names is None:
         names = model.data.input_names
@@ -154,12 +161,9 @@ def _labels(model: Any, term: Term, name: str, number: int) -> list[str]:
             names = transform.column_names(names)
         elif transform is not None:
             after = " after the transform"
-    is_length = name.endswith("lengthscale")
-    if is_length and number == len(names):
-        return [f" of {name}{after}" for name in names]
-    if number == 1:
-        return [after * is_length]
-    return [f" {i + 1}{after * is_length}" for i in range(number)]
+    if number == len(names):
+        labels = [f" of {name}" for name in names]
+    return [f"{label}{after}" for label in labels]
 
 
 def _of_noise(model: Any, sd: Tensor, j: int) -> list[str]:

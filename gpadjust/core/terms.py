@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.core.kernels import Features, Kernel, PullBack
+from gpadjust.core.gpytorch_kernels import OfGPyTorch
+from gpadjust.core.kernels import DELTA, RBF, RHO, Features, Kernel, PullBack, Stationary
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
 
@@ -41,12 +42,33 @@ class Term(NamedTuple):
         return self.kernel is not None or self.constant is not None
 
 
+def as_kernel(kernel: Any, outputscale: LogNormal = DELTA) -> Kernel:
+    """Return a kernel of this library, one of GPyTorch in a wrapper, or the default RBF."""
+    if kernel is None:
+        return Stationary(RBF, outputscale)
+    if isinstance(kernel, Kernel):
+        return kernel.of_term(outputscale)
+    return OfGPyTorch(kernel, outputscale)
+
+
+def with_kernel(term: Any) -> Term:
+    """Return a term with a kernel of this library, also where it has one of GPyTorch."""
+    if not isinstance(term, Term):
+        raise TypeError(f"Expected terms as a list of Term(name, kernel, ...); found {term!r}.")
+    if term.kernel is None:
+        return term
+    kernel = as_kernel(term.kernel, DELTA if term.physics is None else RHO)
+    if not kernel.has_constant:
+        term = term._replace(constant=None)
+    return term._replace(kernel=kernel)
+
+
 class Places(NamedTuple):
     """Points at which a sum is evaluated."""
 
-    x: Tensor  # inputs of kernels, ... x 1 x 1 x n x d
+    kernel_inputs: Tensor  # X after the input transform, ... x 1 x 1 x n x d
     f: Sequence[Tensor]  # the outputs of each physics, ... x S x m x n (1 for S)
-    X: Tensor  # the inputs in the user's units, ... x 1 x 1 x n x d
+    X: Tensor  # the inputs as the user gave them, ... x 1 x 1 x n x d
 
 
 @dataclass
@@ -216,11 +238,9 @@ class TermSum:
         names = [term.name for term in terms]
         if len({*names}) < len(names) or not names or any("." in name for name in names):
             raise ValueError(f"Expected terms with different names without dots; found {names}.")
-        for term in terms:
-            if term.physics is not None and not 0 <= term.physics < len(f):
-                raise ValueError(
-                    f"Term {term.name!r} has physics number {term.physics} of {len(f)} in physics=."
-                )
+        for name, i in ((t.name, t.physics) for t in terms if t.physics is not None):
+            if not 0 <= i < len(f):
+                raise ValueError(f"Term {name!r} has physics number {i} of {len(f)} in physics=.")
         self.terms = tuple(
             term._replace(has_center=term.physics is not None and term.has_center) for term in terms
         )
@@ -271,7 +291,7 @@ class TermSum:
 
     def mean(self, values: Values, places: Places) -> Tensor:
         """Return the prior mean of the sum, ``... x S x m x n``."""
-        total = torch.zeros_like(places.x[..., 0])
+        total = torch.zeros_like(places.kernel_inputs[..., 0])
         for term in self.terms:
             mean = self.mean_of(term, values)
             if term.physics is not None:
@@ -281,13 +301,13 @@ class TermSum:
 
     def evaluate(self, values: Values, places: Places) -> WeightedSum:
         r"""Return the function itself, :math:`\sum_t b_t g_t`."""
-        weights = {}
+        weights, x = {}, places.kernel_inputs
         for term in self.terms:
-            b = torch.ones_like(places.x[..., 0])
+            b = torch.ones_like(x[..., 0])
             if term.physics is not None:
                 b = places.f[term.physics] - self.center(term, values)  # f_p - c
             weights[term.name] = b
-        return WeightedSum(self.terms, values, places.x, self.mean(values, places), weights)
+        return WeightedSum(self.terms, values, x, self.mean(values, places), weights)
 
     def term(self, name: str, values: Values, places: Places) -> WeightedSum:
         r"""Return the process of a term in the user's meaning, :math:`f = \sum_t b_t g_t`.
@@ -295,11 +315,11 @@ class TermSum:
         delta is the term of this name, or the first without a basis.
         """
         term = next(t for t in self.terms if t.name == name)
-        one = torch.ones_like(places.x[..., 0])
+        one = torch.ones_like(places.kernel_inputs[..., 0])
         weights = {name: one}
         # rho (f_p - c) + delta' = rho f_p + (delta' - c (rho - 1)), but for the means
         if name == self.plain:
             centered = [t for t in self.terms if t.has_center]
             weights |= {t.name: -self.center(t, values) * one for t in centered}
         mean = self.mean_of(term, values) * one
-        return WeightedSum(self.terms, values, places.x, mean, weights)
+        return WeightedSum(self.terms, values, places.kernel_inputs, mean, weights)

@@ -110,8 +110,7 @@ class Table:
         self.size = self._own_size + sum(self._sizes[len(self.own) :])
         self.has_other_priors = any(row.log_density is not None for row in rows)
         shares = torch.tensor([c.probability for c in self.choices] or [1.0], dtype=torch.float64)
-        is_single = len(self.choices) == 1
-        if is_single or abs(shares.sum() - 1) > 1e-9 or (shares <= 0).any():
+        if len(self.choices) == 1 or abs(shares.sum() - 1) > 1e-9 or (shares <= 0).any():
             expected = "several choices with positive probabilities that sum to 1"
             raise ValueError(f"Expected {expected}; found {shares.tolist()}.")
         self.log_prior = shares.log()
@@ -186,8 +185,8 @@ class Table:
     def prior_draws(self, number: int, seed: int) -> Tensor:
         """Return coordinates ``number x B x P`` of draws from the prior."""
         generator = torch.Generator().manual_seed(seed)
-        shape = (number, self.problems, self.size)
-        u = standard_normal(shape, generator, self.rows[0].location)
+        like = self.rows[0].location
+        u = standard_normal((number, self.problems, self.size), generator, like)
         if not self.has_other_priors:
             return u
         # Draws from N(0, I) are resampled by p(u) / N(u | 0, I).

@@ -322,7 +322,7 @@ class LearnedDynamics(Dynamics):
             if copy["noise"]:  # a fit replaced the noise by one with corrections
                 noise: Any = model.noise
                 noise = type(noise)(**{**noise.settings, **copy["noise"]})
-                model = model.with_noise(noise.of_terms(model.term_sum))
+                model = model.with_noise(noise.of_data(model.data, model.term_sum))
             model.load_state_dict(copy["model"])
             draws = copy["draws"]
             number = len(model.u)

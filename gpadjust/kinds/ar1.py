@@ -12,9 +12,9 @@ from gpadjust.checks import checked_bounds, checked_whole
 from gpadjust.core import GP, KnownNoise, Noise, Row, Term
 from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, names_of, unit_of
 from gpadjust.core.gaussian import Marginals
-from gpadjust.core.kernels import Features, Kernel, PullBack, as_kernel
+from gpadjust.core.kernels import Features, Kernel, PullBack
 from gpadjust.core.structures import DELTA_CONSTANT
-from gpadjust.core.terms import Places
+from gpadjust.core.terms import Places, as_kernel
 from gpadjust.core.unknowns import Values
 from gpadjust.physics import as_physics
 
@@ -206,7 +206,7 @@ class LevelNoise(Noise):
 
     def shares(self, places: Places) -> Tensor:
         """Return the shares of both variances at each input, ``... x 1 x 1 x n x 2``."""
-        level = places.x[..., -1]
+        level = places.kernel_inputs[..., -1]
         return torch.stack([1 - level, level], -1)
 
     def with_known(self, known: KnownNoise) -> Noise:
@@ -222,5 +222,5 @@ class KnownAtHigh(KnownNoise):
         variances = super().variance(values, places, is_training)
         if not is_training:
             return variances
-        num_low = places.x.shape[-2] - variances.shape[-1]
+        num_low = places.kernel_inputs.shape[-2] - variances.shape[-1]
         return torch.nn.functional.pad(variances, (num_low, 0), value=_EXACT)

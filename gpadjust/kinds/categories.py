@@ -14,8 +14,10 @@ import torch
 from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
-from gpadjust.core.data import ArrayLike, Data, columns_of, names_of
-from gpadjust.core.kernels import DELTA, Features, Fourier, Kernel, PullBack, Stationary
+from gpadjust.checks import checked_columns
+from gpadjust.core.data import ArrayLike, Data, names_of
+from gpadjust.core.fourier import Fourier
+from gpadjust.core.kernels import DELTA, Features, Kernel, PullBack, Stationary
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Row, Values
 
@@ -130,7 +132,7 @@ class Categories(InputTransform):
         """Set columns and levels of texts; `transform` reads levels that are numbers."""
         self.names = names_of(X, "x")
         columns, self.batches, listed = (
-            columns_of(self.names, () if value is None else value, name)
+            checked_columns(name, () if value is None else value, self.names)
             for name, value in self.asked.items()
         )
         levels = levels_of_texts(X, [*columns, *self.batches])

@@ -198,7 +198,7 @@ class _Components:
 
     def _variance(self, function: WeightedSum) -> Tensor:
         """Return the variance by the emulator, ``m x N``."""
-        mean, variance = self.data.marginals(function)
+        mean, variance = self.data.moments(function)
         # Var = E_s Var_s + Var_s m_s
         return variance.mean(0) + mean.var(0, correction=0)
 

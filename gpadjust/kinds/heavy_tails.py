@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 
 from gpadjust.checks import checked_number
 from gpadjust.core import KnownNoise, Noise
+from gpadjust.core.data import Data
 from gpadjust.core.terms import Places, TermSum
 from gpadjust.core.unknowns import Values
 
@@ -95,9 +96,9 @@ class RowNoise(Noise):
         variance = self.base.variance(values, places, is_training)
         return variance + self.added if is_training else variance
 
-    def of_terms(self, terms: TermSum) -> Self:
-        """Return the noise for a model of these terms."""
-        return self.mapped(lambda v: v, "of_terms", terms)
+    def of_data(self, data: Data, terms: TermSum) -> Self:
+        """Return the noise for a model's data and terms."""
+        return self.mapped(lambda v: v, "of_data", data, terms)
 
     def with_known(self, known: KnownNoise) -> Self:
         """Return the noise with known variances in place of an unknown one."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.core import GP, Noise
+from gpadjust.core.data import Data
 from gpadjust.core.kernels import exponents
 from gpadjust.core.terms import Places, TermSum
 
@@ -54,7 +55,7 @@ class RelativeNoise(Noise):
         """The arguments."""
         return {"sizes": self.sizes}
 
-    def of_terms(self, terms: TermSum) -> RelativeNoise:
+    def of_data(self, data: Data, terms: TermSum) -> RelativeNoise:
         """Return the noise with g by the prior mean of a model of these terms."""
         new = RelativeNoise(self.sizes)
         new.means = [(t.physics, t.mean) for t in terms.terms if t.physics is not None]
@@ -66,7 +67,7 @@ class RelativeNoise(Noise):
 
     def shares(self, places: Places) -> Tensor:
         """Return 1 and the square of g, ``... x S x m x n x 2``."""
-        squares = torch.ones_like(places.x[..., 0])
+        squares = torch.ones_like(places.kernel_inputs[..., 0])
         if self.means:
             f_p = torch.stack([mean / self.size * places.f[i] for i, mean in self.means])
             squares = f_p.sum(0).square()
@@ -74,7 +75,8 @@ class RelativeNoise(Noise):
             points, logs, lengths, _ = self.sizes
             middle = points.mean(-2, keepdim=True)
             # log g(x) = (sum_i k(x, x_i) log g_i + c mean_i log g_i) / (sum_i k(x, x_i) + c)
-            near = exponents((places.x - middle) / lengths, (points - middle) / lengths).exp()
+            x = (places.kernel_inputs - middle) / lengths
+            near = exponents(x, (points - middle) / lengths).exp()
             total = (near @ logs.unsqueeze(-1)).squeeze(-1)
             mean = logs.mean(-1, keepdim=True)
             squares = (2 * (total + _FAR * mean) / (near.sum(-1) + _FAR)).exp()

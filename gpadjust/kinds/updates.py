@@ -64,7 +64,7 @@ class Updated(Widened):
         targets = conditioning.targets[0, ..., late]
         new = self._updated(more, f, noises, targets)
         # z^2 of each observation, by the model before the update
-        means, variances = self.model.conditioning().marginals(f)
+        means, variances = self.model.conditioning().moments(f)
         mean, variance = Marginals(means.mT, (variances + noises).mT).prediction
         for squares in ((targets - mean.mT).square() / variance.mT).unbind(-1):
             last = torch.stack([squares.nan_to_num(nan=0.0), (~squares.isnan()).to(squares)], -1)
@@ -202,7 +202,7 @@ class Weights:
         pull = share * self.pull + (weighted @ residual.nan_to_num().unsqueeze(-1)).squeeze(-1)
         return type(self)(self.train, precision, pull)
 
-    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+    def moments(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and variances at each point, ``... x S x m x q``."""
         phi = design(sought)
         mean = sought.mean + (phi @ self.mean.unsqueeze(-1)).squeeze(-1)
@@ -211,7 +211,7 @@ class Weights:
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and covariances, ``... x S x m x q x q``."""
         root = design(sought) @ self.root
-        return self.marginals(sought)[0], root @ root.mT
+        return self.moments(sought)[0], root @ root.mT
 
     @torch.no_grad()
     def moved_to(self, model: GP, outputs: Any = slice(None)) -> Self:

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_finite
-from gpadjust.core.data import Data, as_tensor, columns_of
-from gpadjust.core.kernels import Features, Kernel, as_kernel
-from gpadjust.core.terms import Term
+from gpadjust.checks import check_finite, checked_columns
+from gpadjust.core.data import Data, as_tensor
+from gpadjust.core.kernels import Features, Kernel
+from gpadjust.core.terms import Term, as_kernel
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
 _ROUNDING = 1e-10  # of the variance, added at several places, which may be close to each other
@@ -107,7 +107,8 @@ class Vanishing(Kernel):
                 "values of some columns as a dictionary."
             )
         places = data.X.new_full((len(self.values), d), torch.nan)
-        places[:, columns_of(data.input_names, self.columns, "`where`")] = self.values.to(places)
+        columns = checked_columns("`where`", self.columns, data.input_names)
+        places[:, columns] = self.values.to(places)
         is_free = places.isnan()  # columns R
         terms = getattr(data.transform, "terms", lambda terms: terms)
         new.kernel = terms([Term("k", self.kernel)])[0].kernel.of_data(data)
@@ -134,6 +135,11 @@ class Vanishing(Kernel):
         """Return the unknown parameters of k."""
         rows: list[Row] = self.kernel.rows(x, num_outputs)
         return rows
+
+    def in_user_units(self, name: str, numbers: Tensor, unit: float) -> tuple[str, Tensor]:
+        """Return the name and numbers of a parameter of k in summaries."""
+        shown: tuple[str, Tensor] = self.kernel.in_user_units(name, numbers, unit)
+        return shown
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the covariances of inputs with others, or with themselves; NaN if impossible."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from scipy.special import chdtri
@@ -62,25 +63,25 @@ def rest_of(
     observed = ~residual.isnan()
     residual = residual.nan_to_num()
 
-    def likelihood(has_rest: bool) -> Callable[..., tuple[Tensor, Tensor]]:
-        def log_density(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
-            leaf = u.detach().requires_grad_()
-            with torch.set_grad_enabled(with_gradient):
-                values = table.values(leaf)
-                numbers = {n.removeprefix(_START): v for n, v in values.items() if _START in n}
-                K = has_rest * kernel.covariance(numbers, groups)
-                variance = of_groups(noise(values)).expand(K.shape[:-1])
-            residuals = residual.expand(K.shape[:-1])
-            result = log_likelihood(residuals, K, variance, observed, with_gradient)
-            if not with_gradient:
-                return result.value.sum(0), torch.zeros_like(u)
-            by = (result.by_covariance, result.by_covariance.diagonal(dim1=-1, dim2=-2))
-            parts = [(v, d) for v, d in zip((K, variance), by, strict=True) if v.requires_grad]
-            tensors, slopes = zip(*parts, strict=True)
-            (slope,) = torch.autograd.grad(tensors, leaf, slopes, materialize_grads=True)
-            return result.value.sum(0), slope
-
-        return log_density
+    def log_density(
+        u: Tensor, with_gradient: bool = True, share: float = 1.0
+    ) -> tuple[Tensor, Tensor]:
+        """Return the log likelihood with a share of the rest, 1 or 0, and its gradient."""
+        leaf = u.detach().requires_grad_()
+        with torch.set_grad_enabled(with_gradient):
+            values = table.values(leaf)
+            numbers = {n.removeprefix(_START): v for n, v in values.items() if _START in n}
+            K = share * kernel.covariance(numbers, groups)
+            variance = of_groups(noise(values)).expand(K.shape[:-1])
+        residuals = residual.expand(K.shape[:-1])
+        result = log_likelihood(residuals, K, variance, observed, with_gradient)
+        if not with_gradient:
+            return result.value.sum(0), torch.zeros_like(u)
+        by = (result.by_covariance, result.by_covariance.diagonal(dim1=-1, dim2=-2))
+        parts = [(v, d) for v, d in zip((K, variance), by, strict=True) if v.requires_grad]
+        tensors, slopes = zip(*parts, strict=True)
+        (slope,) = torch.autograd.grad(tensors, leaf, slopes, materialize_grads=True)
+        return result.value.sum(0), slope
 
     # The best of several searches with a rest, and the one without.
     starts = []
@@ -89,11 +90,10 @@ def rest_of(
         values[f"{_START}outputscale"] = 0.3 * size
         u = size.new_full((1, table.problems, table.size), start)
         starts.append(table.with_values(u, values))
-    with_rest = likelihood(True)
-    ends = maximise(with_rest, torch.cat(starts))
-    density = with_rest(ends, False)[0]
+    ends = maximise(log_density, torch.cat(starts))
+    density = log_density(ends, False)[0]
     best = ends[density.argmax(0), torch.arange(m)].unsqueeze(0)
-    without_rest = likelihood(False)
+    without_rest = partial(log_density, share=0.0)
     noise_alone = maximise(without_rest, table.with_values(0 * starts[0], begin))
     # 2 log of the likelihood ratio is chi-squared with as many degrees as k has numbers.
     statistic = 2 * (density.amax(0) - without_rest(noise_alone, False)[0][0])

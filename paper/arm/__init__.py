@@ -16,20 +16,14 @@ if TYPE_CHECKING:
 SCENARIOS = {
     "mf": scenario("mf", "model-free"),
     # Per episode; the best of 30, 100, 300.
-    "mf-best": scenario("mf", "model-free, fewer updates", {"updates": 100}),
+    "mf-best": scenario("mf", "model-free, fewer updates", updates=100),
     "phy": scenario("phy", "Dyna-Phy"),
     "gp": scenario("gp"),
     "cka": scenario("cka"),
     "rra": scenario("rra"),
-    "cka-memory": scenario("cka", "Dyna-CKA, memory", {"memory": True}),
+    "cka-memory": scenario("cka", "Dyna-CKA, memory", memory=True),
 }
 PAPER = ("mf", "phy", "gp", "cka", "rra")  # those that the paper compares
-
-
-def _check_opensim() -> None:
-    from paper.arm.system.opensim import load_opensim
-
-    load_opensim()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,14 +34,10 @@ class Arm(Control):
     episode_length: int = 15
     last_model_episode: int = 30
     later_updates: int = 15
-    evaluate_every: int = 3
-    """episodes between two evaluations; the first is before all"""
-    map_after: int = 9
-    """episodes after which, as at the end, the errors at each target are kept"""
-    strength: float = 0.5
-    """of the muscles; a healthy arm's is 1"""
-    memory: bool = False
-    """whether policy and model see the previous action"""
+    evaluate_every: int = 3  # episodes between two evaluations; the first is before all
+    map_after: int = 9  # episodes after which the errors at each target are kept
+    strength: float = 0.5  # of the muscles; a healthy arm's is 1
+    memory: bool = False  # whether policy and model see the previous action
 
     axes: ClassVar[Axes] = {"scenario": {name: each.label for name, each in SCENARIOS.items()}}
     packages: ClassVar[tuple[str, ...]] = (*Control.packages, "opensim")
@@ -66,7 +56,9 @@ class Arm(Control):
 
     def check(self) -> None:
         """Refuse a machine without OpenSim."""
-        _check_opensim()
+        from paper.arm.system.opensim import load_opensim
+
+        load_opensim()
 
     def setup(self, name: str, seed: int) -> Setup:
         """The arm; nothing in f_p is random."""

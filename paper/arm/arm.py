@@ -49,7 +49,7 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
     if experiment.episodes >= LAST:
         about = claims(episodes, maps)
         judged = {MEASURES[m]: judge(about, of[m], LAST) for m in MEASURES}
-        found["claims"] = Table("Claims", claims_table("claim", judged))
+        found["claims"] = Table("Claims", claims_table(judged))
     for name, measure in (("all", "all_steps"), ("last", "last_five")):
         text = trials_table(
             evaluations, measure, experiment.labels, _SHOWN, (24, LAST), (24, LAST), ".1f"
@@ -94,7 +94,7 @@ def draw(runs: Sequence[Run], experiment: Arm) -> list[Path]:
         ax.axhline(BOUND, color="black", lw=1, ls="--", label="1,000 trials of SAC, all steps")
         ax.set_ylim(0, 70)
 
-    parts = {what: errors.assign(error=errors[measure]) for measure, what in MEASURES.items()}
+    parts = {what: errors.assign(value=errors[measure]) for measure, what in MEASURES.items()}
     labels = ("trial", "hand's RMSE over targets, cm, mean ± sd")
     path = experiment.folder / "figure3.png"
-    return [draw_curves(path, parts, "error", lines, labels=labels, finish=finish)]
+    return [draw_curves(path, parts, lines, labels, finish)]

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from functools import lru_cache, partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from paper.arm import Arm
 from paper.arm.system import arm, hand_distance_cm
 from paper.arm.system.opensim import MUSCLES, REST_ACTIVATION, ArmSimulation, build_muscle_arm
-from paper.arm.system.reaching import START_MEAN, arm_reward, arm_targets
+from paper.arm.system.reaching import START_MEAN, arm_targets
 from paper.arm.system.torque_arm import REAL_ARM
 from paper.cartpole import Scenario
 from paper.cartpole.control import Recorder, Setup, dynamics
@@ -37,26 +35,14 @@ def setup(scenario: Scenario, settings: Arm) -> Setup:
     return Setup(system.make(), system.task(model), recorder)
 
 
-class Policy(Protocol):
-    """A policy that is evaluated."""
-
-    def predict(
-        self, observation: NDArray[np.float32], *, deterministic: bool
-    ) -> tuple[NDArray[np.float32], Any]:
-        """Actions for a batch of observations."""
-        ...
-
-
-def reach(policy: Policy, settings: Arm) -> NDArray[np.float64]:
+def reach(policy: Any, settings: Arm) -> NDArray[np.float64]:
     """The distance of the hand, ``121 x episode_length`` in cm, by the deterministic policy.
 
     The real arm starts at rest at 35° and 65° for each target. All go a step at a time, so that the
     policy is asked once a step. No random number is drawn. An arm whose integration fails stays
     where it is for the rest of its episode, with a warning.
 
-    Args:
-        policy: The agent.
-        settings: Length of an episode, strength of the muscles, and whether the policy remembers.
+    A policy has ``predict(observations, deterministic=True)``, as an agent.
     """
     simulation = _simulation(settings.strength)
     targets = arm_targets().numpy()
@@ -95,55 +81,39 @@ def score(distances: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def hundred() -> NDArray[np.bool_]:
-    """Which of the 121 targets are the paper's hundred, of 10, 20, ..., 100° each."""
-    return (arm_targets() > 0.01).all(-1).numpy()
-
-
 class ArmRecorder(Recorder):
-    """Records the cost of each episode, and evaluates the policy before the first and after some.
+    """Evaluates the policy before the first episode and after some.
 
     ``"evaluations"`` of what it found has a list of numbers for each column: the root mean squares
-    over steps and targets, with ``_100`` those over the paper's hundred targets, and the seconds it
-    took. ``"maps"`` has the root mean squares over steps at each target after some episodes.
+    over steps and targets. ``"maps"`` has those over steps at each target after an episode.
     """
 
-    def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
-        """The mean cost of the sampled actions, in rad."""
-        return {"cost": -arm_reward(states, actions, next_states).mean().item()}
+    def __init__(self, settings: Arm, model_free: bool) -> None:
+        super().__init__(settings, model_free)
+        self.evaluations: dict[str, list[float]] = {}
+        self.maps: dict[str, Any] = {}
 
     def of_policy(self, episode: int) -> dict[str, Any]:
-        """Nothing: evaluations have a log of their own, as there are fewer than episodes."""
+        """Nothing: evaluations have lists of their own, as there are fewer than episodes."""
         if episode % self.settings.evaluate_every == 0:
             self.evaluate(episode)
         return {}
 
     def found(self) -> dict[str, Any]:
-        """The evaluations, and the errors at each target after some of them; and the records."""
-        return {**self.log, **super().found()}
-
-    @property
-    def log(self) -> dict[str, Any]:
-        """The evaluations so far."""
-        log: dict[str, Any] = self.model.notes.setdefault("log", {"evaluations": {}, "maps": {}})
-        return log
+        """The evaluations, the errors at each target after an episode, and the records."""
+        return {"evaluations": self.evaluations, "maps": self.maps, **super().found()}
 
     def evaluate(self, episode: int) -> None:
-        """Write the scores of the agent after an episode (0: before the first) into the log."""
-        start = time.perf_counter()
+        """Write down the scores of the agent after an episode (0: before the first)."""
         by_target = score(reach(self.model, self.settings))
-        row: dict[str, float] = {"episode": episode}
-        for name, errors in by_target.items():
-            row[name] = float(np.sqrt(np.square(errors).mean()))
-            row[f"{name}_100"] = float(np.sqrt(np.square(errors[hundred()]).mean()))
-        row["evaluation_seconds"] = time.perf_counter() - start
-        for name, value in row.items():
-            self.log["evaluations"].setdefault(name, []).append(value)
-        if episode in (self.settings.map_after, self.settings.episodes):
+        row = {name: float(np.sqrt(np.square(each).mean())) for name, each in by_target.items()}
+        for name, value in {"episode": episode, **row}.items():
+            self.evaluations.setdefault(name, []).append(value)
+        if episode == self.settings.map_after:
             maps = {name: errors.round(2).tolist() for name, errors in by_target.items()}
-            self.log["maps"][f"{episode}"] = maps
+            self.maps[f"{episode}"] = maps
 
     def _on_rollout_start(self) -> None:
         super()._on_rollout_start()
-        if not self.log["evaluations"]:
+        if not self.evaluations:
             self.evaluate(0)

@@ -17,35 +17,24 @@ NUM_STARTS = 20  # of the evaluation
 
 @dataclass(frozen=True)
 class Scenario(Learner):
-    """A learner of a control task; its models are literal, at their most likely hyper-parameters.
+    """A learner of a control task; its models are literal, of the most likely hyper-parameters."""
 
-    Args:
-        changes: Settings that it has in place of the shared ones.
-        max_runs: The most seeds that it is run with.
-        kind: ``"learnt"``, or ``"physics"`` for f_p alone, ``"truth"`` for the real system,
-            ``"none"`` for a model-free learner.
-    """
-
+    # Settings that it has in place of the shared ones.
     changes: Mapping[str, Any] = field(default_factory=dict)
-    max_runs: int | None = None
+    max_runs: int | None = None  # the most seeds that it is run with
+    # `"learnt"`, or `"physics"` for f_p alone, `"truth"` for the real system, `"none"` for
+    # a model-free learner.
     kind: str = "learnt"
 
 
-def scenario(
-    name: str,
-    label: str = "",
-    changes: Mapping[str, Any] | None = None,
-    max_runs: int | None = None,
-) -> Scenario:
-    """A scenario of a learner of the registry, or of ``"rra-paper"``, RRA as printed."""
-    known = LEARNERS.get(name, LEARNERS["rra"])
-    model = "paper.forrester.paper_rra:PaperRRA" if name == "rra-paper" else known.model
+def scenario(name: str, label: str = "", max_runs: int | None = None, **changes: Any) -> Scenario:
+    """A scenario of a learner of the registry."""
+    known = LEARNERS[name]
     kind = {"phy": "physics", "oracle": "truth", "mf": "none"}.get(name, "learnt")
-    options = LITERAL if name in ("cka", "rra") else {}
-    return Scenario(
-        label or f"Dyna-{known.label}", known.color, model, options, known.adjusts,
-        changes or {}, max_runs, kind,
-    )  # fmt: skip
+    literal = LITERAL if name in ("cka", "rra") else {}
+    label = label or f"Dyna-{known.label}"
+    own: dict[str, Any] = {"changes": changes, "max_runs": max_runs, "kind": kind}
+    return Scenario(label, known.color, known.model, literal, known.adjusts, **own)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,38 +48,27 @@ class Control(Experiment):
     """real episodes of a run"""
     episode_length: int = 25
     """steps of an episode"""
-    model_episodes: int = 20
-    """episodes in the model after each of the first real ones"""
+    model_episodes: int = 20  # episodes in the model after each of the first real ones
     last_model_episode: int = 25
     """real episodes after which the model is no longer used"""
-    updates_per_model_step: float = 2
-    """gradient steps for each step in the model"""
-    num_particles: int = 5
-    """model episodes side by side"""
+    updates_per_model_step: float = 2  # gradient steps for each step in the model
+    num_particles: int = 5  # model episodes side by side
     refresh_model_data: bool = True
     """whether each new model predicts the earlier ones' transitions again (the paper does not)"""
     updates: int | None = None
     """gradient steps after each episode of a model-free learner; default: as many as the others"""
     later_updates: int = 100
     """gradient steps after each episode without a model"""
-    learning_rate: float = 3e-3
-    """of SAC"""
-    gamma: float = 0.95
-    """of SAC"""
-    tau: float = 0.02
-    """of SAC"""
-    batch_size: int = 256
-    """of SAC"""
-    net_arch: tuple[int, ...] = (128, 128)
-    """of SAC"""
-    ent_coef: str = "auto_0.3"
-    """of SAC"""
-    target_entropy: str | float = "auto"
-    """of SAC"""
+    learning_rate: float = 3e-3  # of SAC
+    gamma: float = 0.95  # of SAC
+    tau: float = 0.02  # of SAC
+    batch_size: int = 256  # of SAC
+    net_arch: tuple[int, ...] = (128, 128)  # of SAC
+    ent_coef: str = "auto_0.3"  # of SAC
+    target_entropy: str | float = "auto"  # of SAC
     target: str = "difference"
     """the targets of dynamics: differences of states, or next states ("absolute")"""
-    num_features: int = 128
-    """of RRA"""
+    num_features: int = 128  # of RRA
 
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3")
     calls: ClassVar[tuple[str, ...]] = (
@@ -100,6 +78,7 @@ class Control(Experiment):
         "stable_baselines3.SAC",
     )
     cheap: ClassVar[Mapping[str, Any]] = {"episodes": 2}
+    digits: ClassVar[int] = 5
     known: ClassVar[Mapping[str, Scenario]]
     """all learners"""
     rmses: ClassVar[Mapping[str, str]]
@@ -144,27 +123,24 @@ class Control(Experiment):
         return {**settings, "task": task, "options": dict(self.known[name].options)}
 
     def run(self, *case: Any) -> dict[str, Any]:
-        """Learn, or go on with it."""
+        """Learn; warnings are shown, as runs are long."""
         from paper.cartpole.control import run
 
         return run(self, *case)
 
 
-# Per episode, of all episodes; the best of 25, 50, 100, 200.
-_FEWER: Mapping[str, Any] = {"updates": 100}
-_PAPER_GP = {"target": "absolute", "encode_angle": False}
-_PAPER_RRA = {"target": "absolute"}
 SCENARIOS = {
     "mf": scenario("mf", "model-free"),
-    "mf-best": scenario("mf", "model-free, fewer updates", _FEWER),
+    # Per episode, of all episodes; the best of 25, 50, 100, 200.
+    "mf-best": scenario("mf", "model-free, fewer updates", updates=100),
     "phy": scenario("phy", "Dyna-Phy"),
     "gp": scenario("gp"),
-    "gp-paper": scenario("gp", "Dyna-GP, paper", _PAPER_GP),
+    "gp-paper": scenario("gp", "Dyna-GP, paper", target="absolute", encode_angle=False),
     "cka": scenario("cka"),
     "rra": scenario("rra"),
-    "rra-paper": scenario("rra-paper", "Dyna-RRA, paper", _PAPER_RRA),
+    "rra-paper": scenario("rra-paper", "Dyna-RRA, paper", target="absolute"),
     "oracle": scenario("oracle", "oracle"),
-    "cka-absolute": scenario("cka", "Dyna-CKA, absolute", {"target": "absolute"}, 4),
+    "cka-absolute": scenario("cka", "Dyna-CKA, absolute", 4, target="absolute"),
 }
 
 
@@ -172,8 +148,7 @@ SCENARIOS = {
 class CartPole(Control):
     """Learners swing up and balance the pole of a cart-pole."""
 
-    encode_angle: bool = True
-    """whether policy and model see sine and cosine of the angle"""
+    encode_angle: bool = True  # whether policy and model see sine and cosine of the angle
 
     axes: ClassVar[Axes] = {"scenario": {name: each.label for name, each in SCENARIOS.items()}}
     curves: ClassVar[tuple[str, ...]] = ("mf", "phy", "gp-paper", "cka", "rra-paper")

@@ -25,7 +25,7 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
             f"{actions} actions": judge(CLAIMS, Curves(episodes, measure), last)
             for measure, actions in MEASURES.items()
         }
-        found["claims"] = Table("Claims", claims_table("claim", judged))
+        found["claims"] = Table("Claims", claims_table(judged))
     for measure, actions in MEASURES.items():
         shown = [trial for trial in (1, 3, 6, 12, 25, 50) if trial <= last]
         text = trials_table(
@@ -41,7 +41,7 @@ def draw(runs: Sequence[Run], experiment: CartPole) -> list[Path]:
     episodes = load(runs, "episodes", experiment)
     known = {name: experiment.known[name] for name in experiment.curves}
     lines = {name: (of.label, of.color) for name, of in known.items()}
-    parts = {f"{actions} actions": episodes.assign(cost=episodes[measure])
+    parts = {f"{actions} actions": episodes.assign(value=episodes[measure])
              for measure, actions in MEASURES.items()}  # fmt: skip
     labels = ("trial", "cost, mean ± standard deviation over runs")
-    return [curves(experiment.folder / "figure2.png", parts, "cost", lines, labels=labels)]
+    return [curves(experiment.folder / "figure2.png", parts, lines, labels)]

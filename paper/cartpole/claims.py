@@ -21,7 +21,6 @@ from paper.common.verdicts import (
     Finding,
     all_of,
     counted,
-    reached,
     reproduced,
     within,
 )
@@ -107,8 +106,8 @@ def _mean(curves: Curves, name: str, first: int, last: int) -> float:
 
 
 def _described(curves: Curves, name: str) -> str:
-    parts = [f"{level} {reached(curves.first_below(name, level))}" for level in (0.5, 0.4)]
-    return f"{', '.join(parts)}, mean of 41-50 {_mean(curves, name, 41, 50):.3f}"
+    late = _mean(curves, name, 41, 50)
+    return f"{curves.described(name, (0.5, 0.4))}, mean of 41-50 {late:.3f}"
 
 
 def _beside(curves: Curves, name: str) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,22 +19,16 @@ from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
 from paper.cartpole import Control, Scenario
 from paper.common.experiment import Run
-from paper.common.tables import groups, number, numbers, table
+from paper.common.tables import groups, number, of, table
 from paper.common.verdicts import Curves
 
 
 class Setup(NamedTuple):
-    """The parts of a run.
+    """The parts of a run."""
 
-    Args:
-        env: The real system; an environment that can be pickled.
-        task: What is known of it.
-        recorder: Writes down what happens.
-    """
-
-    env: gym.Env[Any, Any]
-    task: Task
-    recorder: Recorder
+    env: gym.Env[Any, Any]  # the real system; an environment that can be pickled
+    task: Task  # what is known of it
+    recorder: Recorder  # writes down what happens
 
 
 def dynamics(
@@ -57,8 +51,18 @@ def dynamics(
 def run(experiment: Control, name: str, seed: int) -> Run:
     """Learn."""
     settings, setup = experiment.settings_of(name), experiment.setup(name, seed)
-    options, arguments = _options(experiment, name), _arguments(experiment, name)
-    agent = DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments, seed=seed)
+    shared = (
+        *("model_episodes", "updates_per_model_step", "last_model_episode"),
+        *("refresh_model_data", "num_particles"),
+    )
+    options = DynaOptions(**{key: getattr(settings, key) for key in shared}, score_horizons=())
+    if experiment.known[name].kind == "none":
+        options = replace(options, last_model_episode=0)
+    of_sac = ("learning_rate", "gamma", "tau", "batch_size", "ent_coef", "target_entropy")
+    arguments: dict[str, Any] = {key: getattr(settings, key) for key in of_sac}
+    policy = {"net_arch": list(settings.net_arch), "optimizer_kwargs": {"fused": True}}
+    arguments |= {"policy_kwargs": policy, "device": "cpu", "seed": seed}
+    agent = DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments)
     agent.learn(
         settings.episodes * settings.episode_length,
         callback=setup.recorder,
@@ -67,39 +71,11 @@ def run(experiment: Control, name: str, seed: int) -> Run:
     return setup.recorder.found()
 
 
-def _options(experiment: Control, name: str) -> DynaOptions:
-    settings: Control = experiment.settings_of(name)
-    model_free = experiment.known[name].kind == "none"
-    return DynaOptions(
-        model_episodes=settings.model_episodes,
-        updates_per_model_step=settings.updates_per_model_step,
-        last_model_episode=0 if model_free else settings.last_model_episode,
-        refresh_model_data=settings.refresh_model_data,
-        num_particles=settings.num_particles,
-        score_horizons=(),
-    )
-
-
-def _arguments(experiment: Control, name: str) -> dict[str, Any]:
-    """The arguments of SAC that the settings decide."""
-    settings: Control = experiment.settings_of(name)
-    named = ("learning_rate", "gamma", "tau", "batch_size", "ent_coef", "target_entropy")
-    policy = {"net_arch": list(settings.net_arch), "optimizer_kwargs": {"fused": True}}
-    return {
-        **{key: getattr(settings, key) for key in named},
-        "policy_kwargs": policy,
-        "device": "cpu",
-    }
-
-
 class Recorder(DynaCallback):
     """Records each episode, and sets the number of updates that follows it.
 
-    A record is begun when the episode ends, and finished after the updates, before the next one.
-    Records are notes of the agent, so that checkpoints hold them: one belongs after this callback
-    in the list. Seconds of the parts are of wall time, ``"cpu_seconds"`` what this process took for
-    all of it, on its one core. An experiment says in a subclass what it writes down of an episode,
-    and of the policy after it.
+    A record is begun when the episode ends, and finished after the updates, before the next one. An
+    experiment says in a subclass what it writes down of an episode, and of the policy after it.
 
     Args:
         settings: Of the learner.
@@ -112,8 +88,9 @@ class Recorder(DynaCallback):
         super().__init__()
         self.settings: Any = settings
         self.model_free = model_free
+        self.records: list[dict[str, Any]] = []
         self._record: dict[str, Any] | None = None
-        self._begun = 0.0  # of this process's time
+        self._steps = 0  # of the earlier episodes
 
     def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
         """Entries of the record by an episode's transitions."""
@@ -124,14 +101,10 @@ class Recorder(DynaCallback):
         return {}
 
     def found(self) -> dict[str, Any]:
-        """The records of a run, a list for each column."""
-        return {"episodes": {name: [r[name] for r in self.records] for name in self.records[0]}}
-
-    @property
-    def records(self) -> list[dict[str, Any]]:
-        """Those of the finished episodes."""
-        records: list[dict[str, Any]] = self.model.notes.setdefault("episodes", [])
-        return records
+        """The records of a run, a list for each column but those without any number."""
+        columns = {name: [r[name] for r in self.records] for name in self.records[0]}
+        shown = {n: column for n, column in columns.items() if any(v is not None for v in column)}
+        return {"episodes": shown}
 
     def on_model_fit(self, metrics: dict[str, float]) -> None:
         """Record the scores of the model on the episode, once it can predict."""
@@ -142,37 +115,23 @@ class Recorder(DynaCallback):
 
     def _on_rollout_start(self) -> None:
         self._finish()
-        self._begun = time.process_time()
         episode = len(self.records) + 1
         self.model.gradient_steps = self.settings.updates_after(episode, self.model_free)
 
     def _on_rollout_end(self) -> None:
-        steps = self.num_timesteps - sum(past["steps"] for past in self.records)
-        episode = self.model.recorded_episodes(newest=steps)
+        episode = self.model.recorded_episodes(newest=self.num_timesteps - self._steps)
+        self._steps = self.num_timesteps
         own = self.of_episode(episode.states, episode.actions, episode.next_states)
-        self._record = {"steps": steps, **own, **dict.fromkeys(("nlpd", "coverage", "rmse"))}
+        self._record = {**own, **dict.fromkeys(("nlpd", "coverage", "rmse"))}
 
     def _on_training_end(self) -> None:
         self._finish()
 
     def _finish(self) -> None:
         """Complete the record of the episode whose updates are done, if there is one."""
-        if self._record is None:
-            return
-        agent, log = self.model, self.records
-        has_model = not self.model_free and len(log) < self.settings.last_model_episode
-        left = agent.logger.name_to_value.get("model/left_bounds", 0) if has_model else 0
-        record = {
-            **self._record,
-            **self.of_policy(len(log) + 1),
-            "left_bounds": int(left),
-            "updates": agent._n_updates - sum(past["updates"] for past in log),
-        }
-        for part, seconds in agent.wall_time.items():
-            record[f"{part}_seconds"] = seconds - sum(past[f"{part}_seconds"] for past in log)
-        record["cpu_seconds"] = time.process_time() - self._begun
-        log.append(record)
-        self._record = None
+        if self._record is not None:
+            self.records.append(self._record | self.of_policy(len(self.records) + 1))
+            self._record = None
 
 
 def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
@@ -181,33 +140,33 @@ def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
     Of ``"episodes"`` there is a column for the error of each state; episodes count from 1.
     """
     errors = [f"rmse_{state}" for state in experiment.rmses]
+    place = {name: i for i, name in enumerate(experiment.known)}
     frames = []
-    for name in experiment.known:
-        for each in sorted(
-            (r for r in runs if r["scenario"] == name), key=lambda r: int(r["seed"])
-        ):
-            own = pd.DataFrame(each[entry])
-            if "rmse" in own:
-                of_states = [found or [np.nan] * len(errors) for found in own.pop("rmse")]
-                own[errors] = np.array(of_states, dtype=float)
-                own = own.astype({"nlpd": float, "coverage": float})
-            if "episode" not in own:
-                own.insert(0, "episode", np.arange(len(own)) + 1)
-            own.insert(0, "learner", name)
-            own.insert(1, "seed", each["seed"])
-            frames.append(own)
+    for each in sorted(runs, key=lambda run: (place[run["scenario"]], run["seed"])):
+        lists = dict(each[entry])
+        number = len(next(iter(lists.values()), []))
+        lists.setdefault("episode", [i + 1 for i in range(number)])
+        of_states = [row or [np.nan] * len(errors) for row in lists.pop("rmse", [])]
+        own = pd.DataFrame({"learner": each["scenario"], "seed": each["seed"], **lists})
+        if of_states:
+            own[errors] = np.array(of_states, dtype=float)
+        scores = {name: float for name in ("nlpd", "coverage") if name in own}
+        frames.append(own.astype(scores))
     return pd.concat(frames, ignore_index=True)
 
 
 def foresight(episodes: pd.DataFrame, experiment: Control) -> str:
     """Scores of the models on episodes before they had them, from the second on."""
-    errors = [f"rmse_{state}" for state in experiment.rmses]
-    scored = episodes[episodes["episode"] > 1].groupby("learner", sort=False)
-    table = scored[["nlpd", *errors]].median()
-    table.insert(1, "coverage", scored["coverage"].mean())
-    table = table[table[errors[0]].notna()].rename(index=experiment.labels)
-    headings = [f"RMSE of {what}" for what in experiment.rmses.values()]
-    return numbers(table, ["", "NLPD", "coverage of 95 %", *headings], ".2g")
+    scored = episodes[(episodes["episode"] > 1)]
+    first = f"rmse_{next(iter(experiment.rmses))}"
+    with_models = {*episodes[episodes[first].notna()]["learner"]}
+    scored = scored[scored["learner"].isin(with_models)]
+    columns = {"NLPD": of("nlpd", "median", ".2g"), "coverage of 95 %": of("coverage", form=".2g")}
+    columns |= {
+        f"RMSE of {what}": of(f"rmse_{state}", "median", ".2g")
+        for state, what in experiment.rmses.items()
+    }
+    return table(groups(scored, "learner", experiment.labels), columns)
 
 
 def trials_table(

@@ -17,7 +17,6 @@ from gpadjust.systems.swing_up import (
     REAL_CART_POLE,
     START_MEAN,
     START_STD,
-    believed_cart_pole,
     cart_pole_reward,
     equation_physics,
 )
@@ -31,7 +30,7 @@ def setup(scenario: Scenario, settings: CartPole, seed: int) -> Setup:
     system = cart_pole(seed, encode_angle=encode, episode_length=length)
     physics: Any = system.physics
     model = dynamics(scenario, settings, system.spec, physics, true_physics())
-    recorder = CartPoleRecorder(settings, scenario.kind == "none", seed)
+    recorder = CartPoleRecorder(settings, scenario.kind == "none")
     return Setup(system.make(), system.task(model), recorder)
 
 
@@ -65,17 +64,7 @@ def evaluate(agent: DynaSAC, settings: CartPole) -> float:
 
 
 class CartPoleRecorder(Recorder):
-    """Records the cost of each episode, and that of the deterministic policy after it.
-
-    Args:
-        settings: Of the learner.
-        model_free: Whether it has no model.
-        seed: Of f_p.
-    """
-
-    def __init__(self, settings: CartPole, model_free: bool, seed: int) -> None:
-        super().__init__(settings, model_free)
-        self.seed = seed
+    """Records the cost of each episode, and that of the deterministic policy after it."""
 
     def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
         """The mean cost of the sampled actions."""
@@ -84,7 +73,3 @@ class CartPoleRecorder(Recorder):
     def of_policy(self, episode: int) -> dict[str, Any]:
         """The mean cost of the deterministic policy."""
         return {"evaluation": evaluate(self.model, self.settings)}
-
-    def found(self) -> dict[str, Any]:
-        """The records, and the parameters of f_p, which are random."""
-        return {"physics": vars(believed_cart_pole(self.seed)), **super().found()}

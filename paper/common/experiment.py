@@ -5,6 +5,8 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
@@ -17,7 +19,7 @@ Case = tuple[Any, ...]
 """What is run once: a value of each axis, and a seed."""
 Run = dict[str, Any]
 """A case that was run: its values by name, what identifies the run, and its results."""
-Axes = Mapping[str | tuple[str, ...], Mapping[Any, str]]
+Axes = Mapping[str, Mapping[Any, str]]
 _Self = TypeVar("_Self", bound="Experiment")
 
 
@@ -38,7 +40,6 @@ class Experiment:
 
     - ``run(experiment, *case)``: runs a case with one thread; returns its results, for JSON.
     - ``tables(runs, experiment)``: tables of all runs, by name.
-    - ``first_look(runs)``, if wanted: a short table of the first runs, None if they are too few.
     - ``draw(runs, experiment)``, if there are figures: draws them into ``experiment.folder`` and
       returns their files.
     """
@@ -60,10 +61,11 @@ class Experiment:
     name: ClassVar[str]
     """on the command line, and in the markers of the pages: the class's in lower case"""
     axes: ClassVar[Axes]
-    """by the name of each axis, its values and their labels; the last axis has the learners. If
-    values have several parts, the name is a tuple of theirs and each value a tuple"""
+    """by the name of each axis, its values and their labels; the last axis has the learners"""
     key: ClassVar[tuple[str, ...]]
-    """the names of the parts of a case: those of the axes, and ``"seed"``"""
+    """the names of the parts of a case: the axes, and ``"seed"``"""
+    single: ClassVar[tuple[str, ...]] = ()
+    """learners on which a seed has no influence, which have one run"""
     calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
     """the calls of the library that decide the numbers: the defaults of their arguments are part of
     what identifies a run"""
@@ -71,12 +73,13 @@ class Experiment:
     """whose versions decide the numbers; of the library itself the commit is recorded"""
     cheap: ClassVar[Mapping[str, Any]] = {}
     """settings with which `python -m paper check` makes the beginning of a long run again"""
+    digits: ClassVar[int] = 6
+    """significant digits of the numbers that are kept"""
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__name__.lower()
         if "axes" in cls.__dict__:
-            parts = [name if isinstance(name, tuple) else (name,) for name in cls.axes]
-            cls.key = (*sum(parts, ()), "seed")
+            cls.key = (*cls.axes, "seed")
 
     @property
     def folder(self) -> Path:
@@ -90,7 +93,7 @@ class Experiment:
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """The seeds of a kind of cases (values of all axes); none if it is not to be run."""
-        return self.seeds
+        return self.seeds[:1] if kind[-1] in self.single else self.seeds
 
     def check(self) -> None:
         """Raise a ValueError for an option, or an ImportError for a package, that will not do."""
@@ -103,23 +106,17 @@ class Experiment:
         Raises:
             ValueError: If ``only`` has a name that no axis has.
         """
-        parts = [
-            [value if isinstance(name, tuple) else (value,) for value in values]
-            for name, values in self.axes.items()
-        ]
-        kinds = [tuple(sum(kind, ())) for kind in product(*parts)]
-        names = [dict.fromkeys(str(kind[i]) for kind in kinds) for i in range(len(self.key) - 1)]
-        for unknown in {*self.only}.difference(*names):
-            there = "; ".join(
-                f"{axis}: {', '.join(of)}" for axis, of in zip(self.key, names, strict=False)
-            )
+        names = {axis: [*map(str, values)] for axis, values in self.axes.items()}
+        for unknown in {*self.only}.difference(*names.values()):
+            there = "; ".join(f"{axis}: {', '.join(values)}" for axis, values in names.items())
             raise ValueError(f"--only: there is no {unknown!r}, but there are, by axis, {there}")
-        wanted = [{*of} & {*self.only} or {*of} for of in names]
-        kinds = [k for k in kinds if all(str(v) in w for v, w in zip(k, wanted, strict=True))]
-        outer = len(self.key) - 1 - len(parts[-1][0])
+        wanted = [
+            [value for value in self.axes[axis] if str(value) in self.only] or [*self.axes[axis]]
+            for axis in names
+        ]
         cases = []
-        for first in dict.fromkeys(kind[:outer] for kind in kinds):
-            seeds = {kind: self.seeds_of(*kind) for kind in kinds if kind[:outer] == first}
+        for outer in product(*wanted[:-1]):
+            seeds = {(*outer, last): self.seeds_of(*outer, last) for last in wanted[-1]}
             every = dict.fromkeys(seed for of_kind in seeds.values() for seed in of_kind)
             cases += [(*k, seed) for seed in every for k, those in seeds.items() if seed in those]
         return cases
@@ -139,39 +136,41 @@ class Experiment:
         return self.settings
 
     def defaults(self) -> dict[str, dict[str, Any]]:
-        """The defaults of the arguments of ``calls``, as JSON has them."""
-        return {name: defaults_of(resolve_name(name)) for name in self.calls}
+        """The arguments of ``calls`` that have a default, as JSON has them; others by names."""
+        found = {}
+        for name in self.calls:
+            parameters = inspect.signature(resolve_name(name)).parameters.values()
+            found[name] = {p.name: p.default for p in parameters if p.default is not p.empty}
+        text = json.dumps(found, default=lambda v: getattr(v, "__qualname__", None) or repr(v))
+        plain: dict[str, dict[str, Any]] = json.loads(text)
+        return plain
 
     def run(self, *case: Any) -> Run:
-        """Run a case."""
-        results: Run = self._module().run(self, *case)
+        """Run a case; warnings of single fits are not shown."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            results: Run = self._call("run", self, *case)
         return results
-
-    def first_look(self, runs: Sequence[Run]) -> str | None:
-        """A short table of the first few runs, if the experiment has one and they are enough."""
-        look = getattr(self._module(), "first_look", None)
-        text: str | None = look(runs) if look and runs else None
-        return text
 
     def tables(self, runs: Sequence[Run]) -> dict[str, Table]:
         """The tables of all runs, by name."""
-        tables: dict[str, Table] = self._module().tables(runs, self)
+        tables: dict[str, Table] = self._call("tables", runs, self)
         return tables
 
     def draw(self, runs: Sequence[Run]) -> list[Path]:
         """Draw the figures, if there are any, and return their files."""
-        draw = getattr(self._module(), "draw", None)
-        return draw(runs, self) if draw else []
+        return self._call("draw", runs, self) or []
 
-    def _module(self) -> Any:
-        """The experiment's module, imported when it is needed."""
-        return import_module(f"{type(self).__module__}.{self.name}")
+    def _call(self, function: str, *arguments: Any) -> Any:
+        """What a function of the experiment's module returns; None if there is no such function."""
+        module = import_module(f"{type(self).__module__}.{self.name}")
+        return getattr(module, function, lambda *_: None)(*arguments)
 
 
-def defaults_of(call: Any) -> dict[str, Any]:
-    """The arguments of a call that have a default, as JSON has them; others by their names."""
-    parameters = inspect.signature(call).parameters.values()
-    defaults = {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
-    text = json.dumps(defaults, default=lambda v: getattr(v, "__qualname__", None) or repr(v))
-    plain: dict[str, Any] = json.loads(text)
-    return plain
+def fitted(model: Any, *arguments: Any, **options: Any) -> float:
+    """Fit a model; return the seconds."""
+    from gpadjust import fit
+
+    begin = time.perf_counter()
+    fit(model, *arguments, **options)
+    return time.perf_counter() - begin

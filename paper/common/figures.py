@@ -19,9 +19,8 @@ def save(figure: Figure, path: Path) -> Path:
     drawn = BytesIO()
     with mpl.rc_context({"savefig.dpi": 100}):
         figure.savefig(drawn)
-    Image.open(drawn).convert("RGB").quantize(96, dither=Image.Dither.NONE).save(
-        path, optimize=True
-    )
+    image = Image.open(drawn).convert("RGB").quantize(96, dither=Image.Dither.NONE)
+    image.save(path, optimize=True)
     return path
 
 
@@ -69,28 +68,23 @@ def one_legend(figure: Figure, axes: Iterable[Axes], ncols: int = 3) -> None:
 def curves(
     path: Path,
     parts: Mapping[str, pd.DataFrame],
-    value: str,
     lines: Mapping[str, tuple[str, str]],
-    *,
     labels: tuple[str, str],
-    share: bool = True,
     finish: Callable[[Axes], object] | None = None,
 ) -> Path:
     """Draw mean and standard deviation of a measure over trials, a panel for each part of the runs.
 
     Args:
         path: The file.
-        parts: Runs by the title of their panel, a row for each run and ``episode``.
-        value: The column that is drawn.
+        parts: Runs by the title of their panel: a row for each run and ``episode``, ``value``.
         lines: Label and color of the learners that are drawn.
         labels: What stands below and beside all panels.
-        share: Whether all panels have the same axes.
         finish: Adds to a panel.
     """
-    figure, axes = panels([*parts], 2, (4.2, 3.0), share=share, width=8.0)
+    figure, axes = panels([*parts], 2, (4.2, 3.0), width=8.0)
     for ax, runs in zip(axes, parts.values(), strict=True):
         for name, (label, color) in lines.items():
-            values = runs[runs["learner"] == name].groupby("episode")[value]
+            values = runs[runs["learner"] == name].groupby("episode")["value"]
             mean, sd = values.mean(), values.std()
             if len(mean):
                 ax.fill_between(mean.index, mean - sd, mean + sd, color=color, alpha=0.12, lw=0)
@@ -103,26 +97,3 @@ def curves(
     figure.supylabel(labels[1], fontsize="medium")
     one_legend(figure, axes, ncols=4)
     return save(figure, path)
-
-
-def strips(ax: Axes, rows: Mapping[str, pd.Series[float]], color: str) -> None:
-    """Draw each run of each row as a dot, with its median and quartiles.
-
-    Args:
-        ax: Where.
-        rows: Values of the runs, by the label of the row.
-        color: Of them.
-    """
-    for y, values in enumerate(rows.values()):
-        if y % 2 == 0:
-            ax.axhspan(y - 0.5, y + 0.5, color="0.95", lw=0, zorder=-1)
-        low, middle, high = values.quantile([0.25, 0.5, 0.75])
-        ax.plot([low, high], [y, y], color=color, lw=7, alpha=0.3, solid_capstyle="butt")
-        ax.plot(values, [y] * len(values), "o", color=color, ms=3.5, mew=0, alpha=0.35)
-        ax.plot(middle, y, "|", color="black", ms=11, mew=1.5)
-    ax.set_yticks(range(len(rows)), rows)
-    ax.set_ylim(len(rows) - 0.5, -0.5)
-    ax.tick_params(axis="y", length=0)
-    ax.spines["left"].set_visible(False)
-    ax.grid(axis="x", color="0.85", lw=0.6)
-    ax.set_axisbelow(True)

@@ -11,22 +11,15 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Learner:
-    """A learner.
+    """A learner."""
 
-    Args:
-        label: Its name in tables and figures.
-        color: Its color in figures.
-        model: A class of :mod:`gpadjust`, or ``"module:class"``; None of a learner whose
-            model a chapter makes.
-        options: Of that class.
-        adjusts: Whether the model is given f_p.
-    """
-
-    label: str
-    color: str
+    label: str  # its name in tables and figures
+    color: str  # its color in figures
+    # A class of `gpadjust`, or `"module:class"`; None of a learner whose model a chapter
+    # makes.
     model: str | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
-    adjusts: bool = True
+    options: Mapping[str, Any] = field(default_factory=dict)  # of that class
+    adjusts: bool = True  # whether the model is given f_p
 
     @property
     def make(self) -> Callable[..., Any]:
@@ -52,12 +45,17 @@ LEARNERS = {
     "cka": Learner("CKA", "navy", "CKA"),
     "literal": Learner("CKA, center 0", "tab:blue", "CKA", LITERAL),
     "rra": Learner("RRA", "tab:green", "RRA"),
+    "rra-paper": Learner("RRA", "tab:green", "paper.forrester.paper_rra:PaperRRA"),
     "phymean": Learner("physics mean", "tab:purple", "PhysicsMeanGP"),
+    "delta": Learner("f_p + delta", "tab:purple", "PhysicsMeanGP"),
+    "free": Learner("free delta", "tab:purple", "PhysicsMeanGP"),
     "bias": Learner("GP-bias", "tab:pink", "PhysicsMeanGP"),
     "scale": Learner("GP-scale", "tab:olive", "ScaleGP"),
     "ar1": Learner("AR1", "tab:brown", "AR1"),
     "fitted": Learner("f_p, parameters fitted", "tab:brown"),
     "calibrated": Learner("calibrated f_p", "tab:brown", "CalibratedPhysics"),
+    "formula": Learner("formula, parameters fitted", "tab:brown", "CalibratedPhysics"),
+    "physics": Learner("calibrated physics", "tab:brown", "CalibratedPhysics"),
     # Without data, or without f_p.
     "phy": Learner("f_p alone", "tab:orange"),
     "gp": Learner("GP", "tab:red", "ZeroMeanGP", adjusts=False),

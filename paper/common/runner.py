@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from paper.common.experiment import Case, Experiment, Run, Table
 from paper.common.runs import RunsFile, commit_of, differences, rounded, versions
-from paper.common.tables import aligned, as_document, markdown
+from paper.common.tables import as_document, markdown
 
 
 class Refused(ValueError):  # noqa: N818 - it is no error of the program
@@ -26,7 +26,6 @@ class Refused(ValueError):  # noqa: N818 - it is no error of the program
 
 
 RUNS = "runs.jsonl"
-TABLES = "tables.md"
 PAPER = Path(__file__).parents[1]
 STALE = PAPER / "stale.txt"
 """Learners whose runs today's code does not make again, a line each: experiment and learner."""
@@ -61,18 +60,17 @@ def main(experiment: Experiment) -> None:
     if experiment.only_tables:
         with suppress(ImportError):  # of a simulator that tables do not need
             check_settings(file.path, done, experiment)
-    tables = tables_of(experiment, [*done.values()])
-    for table in tables.values():
-        print(f"\n{table.title}\n\n{aligned(table.text)}")
-    path = write_tables(experiment, tables)
-    print(path, *experiment.draw([*done.values()]), sep="\n")
+    runs = [*done.values()]
+    for table in write_tables(experiment, runs).values():
+        print(f"\n{table.title}\n\n{table.text}")
+    print(experiment.folder / "tables.md", *experiment.draw(runs), sep="\n")
 
 
-def write_tables(experiment: Experiment, tables: Mapping[str, Table]) -> Path:
-    """Write the file of an experiment's tables."""
-    path = experiment.folder / TABLES
-    path.write_text(as_document(tables))
-    return path
+def write_tables(experiment: Experiment, runs: Sequence[Run]) -> dict[str, Table]:
+    """Write the file of an experiment's tables; return these."""
+    tables = tables_of(experiment, runs)
+    (experiment.folder / "tables.md").write_text(as_document(tables))
+    return tables
 
 
 def tables_of(experiment: Experiment, runs: Sequence[Run]) -> dict[str, Table]:
@@ -99,7 +97,9 @@ def stamp(experiment: Experiment, runs: Sequence[Run]) -> str:
     is_committed = experiment.out.resolve() == STALE.parent / "results"
     listed = stale_list() if is_committed else set()
     stale = [learner for learner in learners if f"{experiment.name} {learner}" in listed]
-    text = f"Runs: {'; '.join(parts[:3])}{'; others earlier' * (len(parts) > 3)}."
+    if len(parts) > 3:
+        parts[3:] = ["others earlier"]
+    text = f"Runs: {'; '.join(parts)}."
     if stale:
         which = "" if len(stale) == len(learners) else f" ({', '.join(stale)})"
         text += f" Stale: today's code gives other numbers{which}."
@@ -128,7 +128,6 @@ def run_missing(experiment: Experiment) -> None:
             f"{file.path} has runs that differ from those to come: {others[0]}. Choose another "
             "--out, or remove the file and run all again."
         )
-    shown = _first_look(experiment, done.values()) if missing else True
     bar = tqdm(total=len(cases), initial=len(cases) - len(missing), unit="run", disable=not missing)
     with bar:
         calls = [joblib.delayed(run_one)(experiment, case) for case in missing]
@@ -136,7 +135,6 @@ def run_missing(experiment: Experiment) -> None:
         for case in joblib.Parallel(n_jobs=experiment.jobs, **options)(calls):
             bar.update()
             bar.set_postfix_str("-".join(map(str, case)))
-            shown = shown or _first_look(experiment, file.read().values())
 
 
 def run_one(experiment: Experiment, case: Case) -> Case:
@@ -151,10 +149,9 @@ def run_one(experiment: Experiment, case: Case) -> Case:
         "date": date,
     }
     start = time.process_time()
-    results = rounded(experiment.run(*case))
-    took = {"took": rounded(time.process_time() - start)}
+    results = experiment.run(*case) | {"took": time.process_time() - start}
     named = dict(zip(experiment.key, case, strict=True))
-    runs_file(experiment).append(named | made_by | results | took)
+    runs_file(experiment).append(named | made_by | rounded(results, experiment.digits))
     return case
 
 
@@ -163,8 +160,7 @@ def check_settings(path: Path, done: Mapping[Case, Run], experiment: Experiment)
 
     Settings that only one of them has are not meant: such a run is one of another version.
     """
-    cases = [*replace(experiment, only=()).cases(), *experiment.cases()]
-    kinds = {case[:-1] for case in cases}
+    kinds = {case[:-1] for case in replace(experiment, only=()).cases()}
     for case in (case for case in done if case[:-1] in kinds):
         differ = differences(done[case]["settings"], _described(experiment, case[:-1]))
         if differ:
@@ -185,18 +181,5 @@ def made_otherwise(run: Run, experiment: Experiment) -> str:
 @cache
 def _described(experiment: Experiment, kind: Case) -> dict[str, Any]:
     """The settings of a kind of cases, as JSON has them."""
-    try:
-        described: dict[str, Any] = json.loads(json.dumps(experiment.describe(*kind)))
-    except TypeError as error:
-        raise Refused(
-            f"{experiment.name}: describe() must return what JSON can hold: {error}"
-        ) from None
+    described: dict[str, Any] = json.loads(json.dumps(experiment.describe(*kind)))
     return described
-
-
-def _first_look(experiment: Experiment, runs: Any) -> bool:
-    """Show a short table as soon as there are runs enough; tell whether there were."""
-    text = experiment.first_look(list(runs))
-    if text:
-        tqdm.write(f"\n{aligned(text)}\n")
-    return bool(text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -26,8 +25,8 @@ IDENTIFYING = ("settings", "defaults", "versions", "commit", "date")
 class RunsFile:
     """A file to which runs are added, by any number of processes, and from which none is lost.
 
-    What identifies runs, as their settings and versions, is much the same in all: it has a line of
-    its own, before the first run that was made so, and a name by which runs refer to it.
+    What identifies runs, as their settings and versions, has a line of its own, before the first
+    of the runs that were made so, and a number by which they name it.
 
     A line counts once its end is written. A process that dies while it writes leaves a torn line,
     which no one reads and the next to write removes; one that cannot write (a full disk) takes
@@ -50,21 +49,21 @@ class RunsFile:
         """
         made = {name: run[name] for name in IDENTIFYING if name in run}
         rest = {name: value for name, value in run.items() if name not in made}
-        name = hashlib.sha256(_line(made)).hexdigest()[:12]
-        line = _line({"made_by": name, **rest} if made else rest)
-        identifying = _line({"made_by": name, "identifying": made})
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(f"{self.path}.lock"), open(self.path, "ab", buffering=0) as file:
-            end = self._whole()
-            file.truncate(end)
-            if made and identifying not in self.path.read_bytes().splitlines(keepends=True):
-                line = identifying + line
+            whole = self._whole()
+            file.truncate(len(whole))
+            ways = [json.loads(line) for line in whole.splitlines() if b'"identifying"' in line]
+            name = next((way["made_by"] for way in ways if way["identifying"] == made), len(ways))
+            line = _line({"made_by": name, **rest} if made else rest)
+            if made and name == len(ways):
+                line = _line({"identifying": made, "made_by": name}) + line
             try:
                 while line:  # a full disk takes some of it
                     line = line[file.write(line) :]
                 os.fsync(file.fileno())
             except OSError as error:
-                file.truncate(end)
+                file.truncate(len(whole))
                 raise OSError(
                     error.errno, f"{error.strerror}; the run is not written, all before it are"
                 ) from error
@@ -75,19 +74,15 @@ class RunsFile:
         Raises:
             ValueError: If a line that is whole is none of a run.
         """
-        if not self.path.exists():
-            return {}
         runs: dict[Case, Run] = {}
-        made: dict[str, Run] = {}
-        lines = self.path.read_bytes()[: self._whole()].splitlines()
-        for number, line in enumerate(lines, start=1):
+        made: dict[Any, Run] = {None: {}}
+        for number, line in enumerate(self._whole().splitlines(), start=1):
             try:
                 run = json.loads(line)
                 if "identifying" in run:
                     made[run["made_by"]] = run["identifying"]
                     continue
-                if "made_by" in run:
-                    run |= made[run.pop("made_by")]
+                run |= made[run.pop("made_by", None)]
                 case = tuple(run[name] for name in self.key)
             except (ValueError, KeyError, TypeError) as error:
                 raise ValueError(
@@ -97,9 +92,10 @@ class RunsFile:
             runs[case] = run
         return runs
 
-    def _whole(self) -> int:
-        """The length of the file without a torn last line."""
-        return self.path.read_bytes().rfind(b"\n") + 1
+    def _whole(self) -> bytes:
+        """The file without a torn last line."""
+        content = self.path.read_bytes() if self.path.exists() else b""
+        return content[: content.rfind(b"\n") + 1]
 
 
 def _line(entries: Run) -> bytes:
@@ -129,14 +125,14 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
     return numbers
 
 
-def rounded(value: Any) -> Any:
-    """Six significant digits of numbers, also in lists and dictionaries; None for nan."""
+def rounded(value: Any, digits: int) -> Any:
+    """Significant digits of numbers, also in lists and dictionaries; None for nan."""
     if isinstance(value, float):
-        return None if math.isnan(value) else float(f"{value:.6g}")
+        return None if math.isnan(value) else float(f"{value:.{digits}g}")
     if isinstance(value, list | tuple):
-        return [rounded(entry) for entry in value]
+        return [rounded(entry, digits) for entry in value]
     if isinstance(value, dict):
-        return {key: rounded(entry) for key, entry in value.items()}
+        return {key: rounded(entry, digits) for key, entry in value.items()}
     return value
 
 
@@ -158,7 +154,7 @@ def commit_of(root: Path) -> tuple[str, str] | None:
         return None
     command = ("status", "--porcelain", "--untracked-files=no", "--", ".", ":!paper/results")
     commit, date = shown.split()
-    return commit + "+" * bool(_git(root, *command)), date
+    return f"{commit}+" if _git(root, *command) else commit, date
 
 
 def _git(root: Path, *command: str) -> str | None:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from paper.common.experiment import Run, Table
 from paper.common.runs import IDENTIFYING
-from paper.common.verdicts import Judged
+from paper.common.verdicts import Difference, Judged, paired
 
 Cell = Callable[[pd.DataFrame], Any]
 """What a cell shows of the runs of its row."""
@@ -34,11 +34,11 @@ def frame(
     """
     if not lists:
         return pd.DataFrame([{k: v for k, v in r.items() if k not in IDENTIFYING} for r in runs])
+    names = [lists] if isinstance(lists, str) else lists
     rows = []
     for run in runs:
-        columns = run[lists] if isinstance(lists, str) else {name: run[name] for name in lists}
-        left = {*IDENTIFYING, *([lists] if isinstance(lists, str) else lists)}
-        own = {name: value for name, value in run.items() if name not in left}
+        columns = run[lists] if isinstance(lists, str) else {n: run[n] for n in names if n in run}
+        own = {name: run[name] for name in run if name not in {*IDENTIFYING, *names}}
         each = zip(*columns.values(), strict=True)
         rows += [
             {**own, index: i, **dict(zip(columns, values, strict=True))}
@@ -71,28 +71,60 @@ def groups(
     return {label(*([v] if isinstance(by, str) else v)): part for v, part in parts.items()}
 
 
-def of(value: str, how: str | Callable[[Any], float] = "mean", form: str = ".3g") -> Cell:
+def of(
+    value: str,
+    how: str | Callable[[Any], float] = "mean",
+    form: str = ".3g",
+    **only: Any,
+) -> Cell:
     """A cell with a statistic of a column; empty where there is none.
 
     Args:
         value: The column.
         how: The statistic: a name that pandas knows, or a function of the values.
         form: Of the number.
+        only: Values of other columns, of the runs that are taken.
     """
 
     def cell(runs: pd.DataFrame) -> str:
+        values = pd.to_numeric(part_of(runs, **only)[value])
         if how == "mean":
-            return number(exact_mean(runs[value]), form)
+            known = values.dropna()
+            # In whatever order the values are.
+            return number(math.fsum(known) / len(known) if len(known) else math.nan, form)
         # As one group: of values that are all alike pandas then finds a spread of 0.
-        return number(runs.groupby(lambda _: 0)[value].agg(how).get(0), form)
+        return number(values.groupby(lambda _: 0).agg(how).get(0), form)
 
     return cell
 
 
-def exact_mean(values: pd.Series[float]) -> float:
-    """The mean, in whatever order the values are; nan are left out, and the mean of none."""
-    known = values.dropna()
-    return math.fsum(known) / len(known) if len(known) else math.nan
+def part_of(runs: pd.DataFrame, **only: Any) -> pd.DataFrame:
+    """The runs that have these values in these columns."""
+    for column, value in only.items():
+        runs = runs[runs[column] == value]
+    return runs
+
+
+def mean_error(
+    value: str, form: str, error: str | None = None, *, counted: bool = False, **only: Any
+) -> Cell:
+    """A cell with the mean, its standard error if runs differ, and of how many it is."""
+
+    def cell(runs: pd.DataFrame) -> str:
+        found = Difference.of(pd.to_numeric(part_of(runs, **only)[value]))
+        text = number(found.mean, form)
+        if found.n > 1:
+            text += f" ± {found.error:{error or form}}"
+        return text + (f" ({found.n})" if counted and found.n > 1 else "")
+
+    return cell
+
+
+def ratio_of(
+    value: str, name: str, other: str, on: Sequence[str] = ("seed",), by: str = "learner"
+) -> Cell:
+    """A cell with the geometric mean of ratios of two learners and its 95 % interval, paired."""
+    return lambda runs: paired(runs, value, by, name, other, on, ratio=True).ratio()
 
 
 def across(runs: pd.DataFrame, by: str, labels: Mapping[Any, str], cell: Cell) -> dict[str, Cell]:
@@ -109,8 +141,7 @@ def table(
     rows: Mapping[str, pd.DataFrame],
     columns: Mapping[str, Cell],
     corner: str = "",
-    *,
-    bold: bool = False,
+    more: Iterable[Sequence[str]] = (),
 ) -> str:
     """A table of runs.
 
@@ -118,45 +149,17 @@ def table(
         rows: The runs of each row, by its label, as ``groups`` makes them.
         columns: What cells show of them, by the heads of columns.
         corner: The head of the labels.
-        bold: Whether the lowest number of a row is bold, and what looks the same.
+        more: Further rows, such as published numbers; cells that they lack are empty.
     """
-    found = []
-    for label, runs in rows.items():
-        cells = [str(cell(runs)) for cell in columns.values()]
-        if bold:
-            best = min((cell for cell in cells if cell), key=float, default="")
-            cells = [f"**{cell}**" if cell and cell == best else cell for cell in cells]
-        found.append([label, *cells])
-    return markdown([corner, *columns], found)
+    lines = [[label, *(str(cell(r)) for cell in columns.values())] for label, r in rows.items()]
+    lines += [[*row, *[""] * (1 + len(columns) - len(row))] for row in more]
+    return markdown([corner, *columns], lines)
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table."""
+    """A table of texts."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def with_rows(text: str, rows: Iterable[Sequence[str]]) -> str:
-    """A table with further rows, such as published numbers; cells that they lack are empty."""
-    width = text.partition("\n")[0].count(" | ") + 1
-    lines = [[*row, *[""] * (width - len(row))] for row in rows]
-    return "\n".join([text, *("| " + " | ".join(line) + " |" for line in lines)])
-
-
-def aligned(text: str) -> str:
-    """A text whose tables have columns of equal width, as a terminal shows them."""
-    return re.sub(r"^\|.*\|(\n\|.*\|)*$", _aligned, text, flags=re.MULTILINE)
-
-
-def _aligned(match: re.Match[str]) -> str:
-    rows = [line[2:-2].split(" | ") for line in match[0].splitlines()]
-    del rows[1]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    rows.insert(1, ["-" * width for width in widths])
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    )
 
 
 def as_document(tables: Mapping[str, Table]) -> str:
@@ -201,31 +204,17 @@ def _check_markers(text: str) -> None:
             raise ValueError(f"<!-- {match[1]} --> has no {_END} before the next marker; add it.")
 
 
-def number(value: Any, form: str = ".3g", missing: str = "") -> str:
-    """A number in a cell."""
-    return missing if pd.isna(value) else format(value, form)
+def number(value: Any, form: str = ".3g") -> str:
+    """A number in a cell, which is empty if there is none."""
+    return "" if pd.isna(value) else format(value, form)
 
 
-def numbers(table: pd.DataFrame, header: Sequence[str], form: str) -> str:
-    """A table of numbers, its index first."""
-    rows = [
-        [str(label), *(number(value, form) for value in values)]
-        for label, values in zip(table.index, table.to_numpy(), strict=True)
-    ]
-    return markdown(header, rows)
-
-
-def claims_table(kind: str, parts: Mapping[str, Sequence[Judged]]) -> str:
-    """Verdicts on the same claims, side by side.
-
-    Args:
-        kind: What they are called.
-        parts: Of each column, by its heading.
-    """
+def claims_table(parts: Mapping[str, Sequence[Judged]]) -> str:
+    """Verdicts on the same claims, side by side: of each column, by its heading."""
     rows = []
     for judged in zip(*parts.values(), strict=True):
         found = [f"**{claim.verdict}**: {claim.measured}" for claim in judged]
         if len(found) == 2 and found[0] == found[1]:
             found[1] = "the same"
         rows.append([judged[0].id, judged[0].claim, *found])
-    return markdown(["", kind, *parts], rows)
+    return markdown(["", "claim", *parts], rows)

@@ -4,38 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 from scipy import stats
+from torch import Tensor
 
 Verdict = Literal[
-    "reproduced",
-    "not reproduced",
-    "beaten",
-    "inconclusive",
-    "undetermined",
-    "not run",
+    "not reproduced", "inconclusive", "undetermined", "reproduced", "beaten", "not run"
 ]
+_FROM_WORST: tuple[Verdict, ...] = (
+    *("not reproduced", "inconclusive", "undetermined", "reproduced", "beaten"),
+)
 Finding = tuple[Verdict, str]
-_RESAMPLES = 5000
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The mean of paired differences, with what it may be.
+    """The mean of paired differences, with what it may be."""
 
-    Args:
-        mean: The mean.
-        error: Its standard error; nan of fewer than two.
-        n: Of how many differences it is.
-    """
-
-    mean: float
-    error: float
-    n: int
+    mean: float  # the mean
+    error: float  # its standard error; nan of fewer than two
+    n: int  # of how many differences it is
 
     @classmethod
     def of(cls, values: ArrayLike) -> Difference:
@@ -87,19 +79,10 @@ def paired(
     *,
     ratio: bool = False,
 ) -> Difference:
-    """How much more a value is for one entry of a column than for another, pair by pair.
+    """How much more a value is for one entry of the column ``by`` than for another, pair by pair.
 
-    Args:
-        runs: A row for each run.
-        value: The column of the value.
-        by: The column that tells the two apart, such as ``"learner"``.
-        name: One of its entries.
-        reference: The other.
-        on: The columns that runs of a pair share.
-        ratio: Whether logarithms are compared, so that it is one of ratios.
-
-    Returns:
-        nan if there is no pair.
+    Runs of a pair share the columns ``on``; of ratios logarithms are compared. It is nan if there
+    is no pair.
     """
     wide = runs.pivot_table(index=[*on], columns=by, values=value)
     if not {name, reference} <= {*wide}:
@@ -108,34 +91,23 @@ def paired(
     return Difference.of(wide[name] - wide[reference])
 
 
-def bootstrap(
-    samples: Sequence[ArrayLike], statistic: Callable[..., Any], paired: bool = False
-) -> tuple[float, float]:
-    """The 95 % percentile interval of a statistic, from a generator of its own."""
-    found = stats.bootstrap(
-        [np.asarray(sample, dtype=float) for sample in samples],
-        statistic,
-        paired=paired,
-        n_resamples=_RESAMPLES,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+def scores_of(mean: Tensor, low: Tensor, high: Tensor, measured: Tensor) -> dict[str, Any]:
+    """Error, coverage and half width of intervals of a path of ``n``."""
+    inside = (low <= measured) & (measured <= high)
+    return {
+        "rmse": float((mean - measured).square().mean().sqrt()),
+        "coverage": float(inside.double().mean()),
+        "half_width": float((high - low).mean() / 2),
+    }
 
 
 @dataclass(frozen=True)
 class Curves:
-    """A measure over the episodes, of several learners with several seeds.
+    """A measure over the episodes, of several learners with several seeds."""
 
-    Args:
-        runs: A row for each learner, ``seed`` and ``episode``, as ``tables.frame`` makes.
-        measure: The column that is looked at.
-        reference: The learner that others are compared with, seed by seed.
-    """
-
+    # A row for each learner, `seed` and `episode`, as `tables.frame` makes.
     runs: pd.DataFrame
-    measure: str
-    reference: str = "cka"
+    measure: str  # the column that is looked at
 
     @property
     def names(self) -> list[str]:
@@ -179,20 +151,22 @@ class Curves:
         return own[own["episode"].between(first, last)].groupby("seed")[self.measure].mean()
 
     def paired_difference(
-        self, name: str, first: int, last: int, reference: str | None = None
+        self, name: str, first: int, last: int, reference: str = "cka"
     ) -> Difference:
         """How much more a learner has than another with the same seeds, over some episodes.
 
         It is nan for the reference itself, and where no seed is shared.
         """
-        other = self.reference if reference is None else reference
-        if name == other:
+        if name == reference:
             return Difference.of([])
-        return Difference.of(self.window(name, first, last) - self.window(other, first, last))
+        return Difference.of(self.window(name, first, last) - self.window(reference, first, last))
+
+    def described(self, name: str, levels: Sequence[float], unit: str = "") -> str:
+        """When the mean first was at some levels, in words."""
+        return ", ".join(f"{x}{unit} {reached(self.first_below(name, x))}" for x in levels)
 
 
-@dataclass(frozen=True)
-class Judged:
+class Judged(NamedTuple):
     """A claim, its verdict, and the numbers behind it."""
 
     id: str
@@ -201,31 +175,21 @@ class Judged:
     measured: str
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claim of the paper about curves.
+class Claim(NamedTuple):
+    """A claim of the paper about curves."""
 
-    Args:
-        id: Ours, in the order of the paper.
-        text: What it says.
-        needed: The learners that it is about.
-        decide: Gives verdict and numbers, from curves of the seeds with which all of ``needed``
-            were run to their end; other learners may lack some of these.
-    """
-
-    id: str
-    text: str
-    needed: tuple[str, ...]
+    id: str  # ours, in the order of the paper
+    text: str  # what it says
+    needed: tuple[str, ...]  # the learners that it is about
+    # Gives verdict and numbers, from curves of the seeds with which all of `needed` were run to
+    # their end; other learners may lack some of these.
     decide: Callable[[Curves], Finding]
 
 
 def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
-    """All claims, each by the seeds that all its learners have; one that lacks them is not judged.
+    """All claims, each by the seeds with which all its learners reached the last episode.
 
-    Args:
-        claims: What is judged.
-        curves: Of all runs.
-        last: The episode that a run must have reached.
+    One of fewer than two such seeds is not judged.
     """
     found = []
     for claim in claims:
@@ -249,29 +213,26 @@ def reproduced(held: bool, beaten: bool = False) -> Verdict:
     return "beaten" if beaten else "reproduced"
 
 
-def within(difference: Difference, low: float = -np.inf, high: float = np.inf) -> Verdict:
-    """Whether a difference is between two bounds.
-
-    Inconclusive if a bound is in its 95 % interval; of one run, or of runs that are all alike, what
-    it is decides.
-    """
-    half = np.nan_to_num(difference.half_width)
-    least, most = difference.mean - half, difference.mean + half
+def between(ends: Sequence[float], low: float = -np.inf, high: float = np.inf) -> Verdict:
+    """Whether an interval lies between two bounds; inconclusive if a bound lies in it."""
+    least, most = ends
     if low <= least and most <= high:
         return "reproduced"
     return "not reproduced" if most < low or high < least else "inconclusive"
 
 
+def within(difference: Difference, low: float = -np.inf, high: float = np.inf) -> Verdict:
+    """Whether a difference is between two bounds, by its 95 % interval.
+
+    Of one run, or of runs that are all alike, what it is decides.
+    """
+    half = np.nan_to_num(difference.half_width)
+    return between((difference.mean - half, difference.mean + half), low, high)
+
+
 def all_of(*verdicts: Verdict) -> Verdict:
     """The verdict on a claim of several parts: the worst of theirs."""
-    order: tuple[Verdict, ...] = (
-        "not reproduced",
-        "inconclusive",
-        "undetermined",
-        "reproduced",
-        "beaten",
-    )
-    return min(verdicts, key=order.index)
+    return min(verdicts, key=_FROM_WORST.index)
 
 
 def counted(runs: int) -> str:

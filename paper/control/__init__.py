@@ -23,24 +23,17 @@ class Known(Experiment):
     runs: int = 5
     trials: int = 3
     """real trials of a run, of which the first goes by f_p, or is random where there is none"""
-    sequences: int = 128
-    """that are planned at each step, in each round of the cross-entropy method"""
-    rounds: int = 0
-    """of these after the first"""
-    first_sequences: int = 128
-    """that are planned when a trial begins, of all its steps"""
-    first_rounds: int = 2
-    """of these after the first"""
-    elites: int = 12
-    """of a round"""
+    sequences: int = 128  # that are planned at each step, in each round of the cross-entropy method
+    rounds: int = 0  # of these after the first
+    first_sequences: int = 128  # that are planned when a trial begins, of all its steps
+    first_rounds: int = 2  # of these after the first
+    elites: int = 12  # of a round
     spread: float = 0.15
     """of the sequences about the earlier plan, in shares of the range of the actions"""
     fit: Literal["map", "bayes"] = "map"
     """of the learnt models; "bayes", the default of the library, takes twice as long"""
-    networks: int = 5
-    """of an ensemble"""
-    training: int = 250
-    """steps of Adam after each trial, of these"""
+    networks: int = 5  # of an ensemble
+    training: int = 250  # steps of Adam after each trial, of these
 
     axes: ClassVar[Axes] = {
         "system": {
@@ -75,8 +68,7 @@ class First(Experiment):
     """The first trials of cart-poles, by the library's defaults; found with seeds of 100 on."""
 
     runs: int = 20
-    trials: int = 5
-    """real trials of a run, of which the first goes by f_p"""
+    trials: int = 5  # real trials of a run, of which the first goes by f_p
 
     axes: ClassVar[Axes] = {"model": {"cka": "CKA", "truth": "the true system"}}
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")

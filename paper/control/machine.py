@@ -25,58 +25,48 @@ Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Machine:
-    """A real system and what is believed of it.
+    """A real system and what is believed of it."""
 
-    Args:
-        spec: What states and actions are, with the duration of a step.
-        rates: Its equation of motion.
-        true: The parameters of the real system.
-        believed: Those that f_p has, with the crude value as the guess; the others are zero there.
-        reward: Known rewards, in [-1, 0].
-        actions: The least and the largest values of the actions.
-        starts: The least and the largest values of the states at which episodes start.
-        episode_length: In steps.
-        substeps: Of the integration of f_p, in a step; the real one, whose friction is stiff, has
-            twice as many.
-        bounds: The least and the largest values that states can have, if that is known.
-    """
-
-    spec: StateSpec
-    rates: Rates
-    true: Mapping[str, float]
+    spec: StateSpec  # what states and actions are, with the duration of a step
+    rates: Rates  # its equation of motion
+    true: Mapping[str, float]  # the parameters of the real system
+    # Those that f_p has, with the crude value as the guess; the others are zero there.
     believed: Mapping[str, Unknown]
-    reward: Reward
-    actions: tuple[list[float], list[float]]
+    reward: Reward  # known rewards, in [-1, 0]
+    actions: tuple[list[float], list[float]]  # the least and the largest values of the actions
+    # The least and the largest values of the states at which episodes start.
     starts: tuple[list[float], list[float]]
-    episode_length: int
+    episode_length: int  # in steps
+    # Of the integration of f_p, in a step; the real one, whose friction is stiff, has twice as
+    # many.
     substeps: int = 2
+    # The least and the largest values that states can have, if that is known.
     bounds: tuple[list[float], list[float]] | None = None
+    # The environment; `MachineEnv` unless there is another.
+    env: Callable[..., gym.Env[Any, Any]] | None = None
 
     def physics(self, kind: Physics = "crude") -> ODEPhysics:
         """The next values of the states that move."""
-        lacking = dict.fromkeys(self.true, 0.0)
         guesses = {name: known.guess for name, known in self.believed.items()}
-        step, dim = self.spec.step or 1.0, len(self.spec.moving)
-        substeps = self.substeps * (2 if kind == "true" else 1)
-        make = partial(ODEPhysics, step=step, state_dim=dim, substeps=substeps)
-        name = self.rates.__name__
-        if kind == "unknown":
-            rates = partial(_rates, self.rates, lacking)
-            return make(rates, unknowns=self.believed, name=name)
-        known = self.true if kind == "true" else {**lacking, **guesses}
-        return make(partial(_rates, self.rates, known), name=name)
+        fixed = self.true if kind == "true" else dict.fromkeys(self.true, 0.0) | guesses
+        return ODEPhysics(
+            partial(_rates, self.rates, fixed),
+            step=self.spec.step or 1.0,
+            state_dim=len(self.spec.moving),
+            substeps=self.substeps * (2 if kind == "true" else 1),
+            unknowns=self.believed if kind == "unknown" else None,
+            name=self.rates.__name__,
+        )
 
     def start(self, n: int) -> Tensor:
         """States at which episodes start, ``n x state_dim``, by PyTorch's generator."""
         low, high = torch.tensor(self.starts, dtype=torch.float64)
         return low + (high - low) * torch.rand(n, len(low), dtype=torch.float64)
 
-    def system(
-        self, physics: Physics = "crude", env: Callable[..., gym.Env[Any, Any]] | None = None
-    ) -> System:
-        """The system; its environment is :class:`MachineEnv` unless there is another."""
+    def system(self, physics: Physics = "crude") -> System:
+        """The system with an f_p."""
         return System(
-            env or partial(MachineEnv, self),
+            self.env or partial(MachineEnv, self),
             self.spec,
             self.physics(physics),
             self.reward,

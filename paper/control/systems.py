@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,8 @@ from torch import Tensor
 
 from gpadjust.physics import Unknown
 from gpadjust.states import StateSpec
-from gpadjust.systems import System
 from paper.control import equations
-from paper.control.machine import Machine, Physics
+from paper.control.machine import Machine
 from paper.machines.pendulums import DOUBLE_PENDULUM
 
 
@@ -36,20 +35,8 @@ def pendulum_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Ten
     return -cost / (math.pi**2 + 0.1 * 8**2 + 0.001 * 2**2)
 
 
-PENDULUM = Machine(
-    StateSpec(["theta", "theta_dot"], ["torque"], angles=["theta"], step=0.1),
-    equations.pendulum,
-    true={"mass": 1.0, "length": 1.0, "viscous": 0.05, "dry": 0.2},
-    believed={
-        "mass": Unknown(1.3, factor=1.5, unit="kg"),
-        "length": Unknown(1.0, factor=1.1, unit="m"),
-        "viscous": Unknown(0.0, sd=0.1, unit="N m s"),
-    },
-    reward=pendulum_reward,
-    actions=([-2.0], [2.0]),
-    starts=([math.pi - 0.2, -0.2], [math.pi + 0.2, 0.2]),
-    episode_length=50,
-)
+_FRICTION = {"viscous": 0.05, "dry": 0.2}
+_STARTS = ([math.pi - 0.2, -0.2], [math.pi + 0.2, 0.2])
 
 
 class FrictionPendulumEnv(PendulumEnv):
@@ -66,15 +53,15 @@ class FrictionPendulumEnv(PendulumEnv):
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         """Start from hanging, nearly at rest."""
         super().reset(seed=seed)
-        self.state = self.np_random.uniform(*PENDULUM.starts)
+        self.state = self.np_random.uniform(*_STARTS)
         return self._get_obs(), {}
 
     def step(self, u: NDArray[Any]) -> Any:
         """Hold a torque."""
-        torque = np.asarray(u, dtype=float).clip(*np.array(PENDULUM.actions))
+        torque = np.asarray(u, dtype=float).clip(*(-2.0, 2.0))
         before = self.state
         for _ in range(10):
-            lost = equations.friction(torch.tensor(self.state[1:]), PENDULUM.true)
+            lost = equations.friction(torch.tensor(self.state[1:]), _FRICTION)
             super().step(torque - lost.numpy())
         rows = (torch.from_numpy(each)[None] for each in (before, torque, self.state))
         return self._get_obs(), pendulum_reward(*rows).item(), False, False, {}
@@ -84,12 +71,25 @@ class FrictionPendulumEnv(PendulumEnv):
         return np.array([sin, cos, rate])
 
 
-def pendulum(physics: Physics = "crude") -> System:
-    """Gymnasium's Pendulum-v1 with friction, from hanging; f_p is 30 % too heavy and has none.
+PENDULUM = Machine(
+    StateSpec(["theta", "theta_dot"], ["torque"], angles=["theta"], step=0.1),
+    equations.pendulum,
+    true={"mass": 1.0, "length": 1.0, **_FRICTION},
+    believed={
+        "mass": Unknown(1.3, factor=1.5, unit="kg"),
+        "length": Unknown(1.0, factor=1.1, unit="m"),
+        "viscous": Unknown(0.0, sd=0.1, unit="N m s"),
+    },
+    reward=pendulum_reward,
+    actions=([-2.0], [2.0]),
+    starts=_STARTS,
+    episode_length=50,
+    env=FrictionPendulumEnv,
+)
+"""Gymnasium's Pendulum-v1 with friction, from hanging; f_p is 30 % too heavy and has none.
 
-    Torques of at most 2 N m, held for 0.1 s, an episode of 5 s.
-    """
-    return PENDULUM.system(physics, FrictionPendulumEnv)
+Torques of at most 2 N m, held for 0.1 s, an episode of 5 s.
+"""
 
 
 def furuta_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
@@ -119,14 +119,10 @@ FURUTA = Machine(
     starts=([-0.1, math.pi - 0.1, -0.1, -0.1], [0.1, math.pi + 0.1, 0.1, 0.1]),
     episode_length=40,
 )  # fmt: skip
+"""A Furuta pendulum of a QUBE-Servo's size; f_p lacks friction and the induced voltage.
 
-
-def furuta(physics: Physics = "crude") -> System:
-    """A Furuta pendulum of a QUBE-Servo's size; f_p lacks friction and the induced voltage.
-
-    Masses and torque of f_p are 16 to 25 % off. At most 10 V, held for 0.04 s, an episode of 1.6 s.
-    """
-    return FURUTA.system(physics)
+Masses and torque of f_p are 16 to 25 % off. At most 10 V, held for 0.04 s, an episode of 1.6 s.
+"""
 
 
 def quadrotor_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
@@ -155,14 +151,10 @@ QUADROTOR = Machine(
     starts=([-1.0, -1.0, -0.3, -0.5, -0.5, -0.5], [1.0, 1.0, 0.3, 0.5, 0.5, 0.5]),
     episode_length=40,
 )
+"""A planar quadrotor that flies to the origin; f_p lacks drag, and is a fifth too light.
 
-
-def quadrotor(physics: Physics = "crude") -> System:
-    """A planar quadrotor that flies to the origin; f_p lacks drag, and is a fifth too light.
-
-    Thrusts of at most 6 N each, held for 0.05 s, an episode of 2 s.
-    """
-    return QUADROTOR.system(physics)
+Thrusts of at most 6 N each, held for 0.05 s, an episode of 2 s.
+"""
 
 
 def double_pendulum_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
@@ -191,16 +183,12 @@ PENDUBOT = Machine(
     episode_length=40,
     substeps=3,
 )
+"""RealAIGym's pendubot, hanging at first: two links, of which the first alone has a drive.
 
-
-def double_pendulum(physics: Physics = "crude") -> System:
-    """RealAIGym's pendubot, hanging at first: two links, of which the first alone has a drive.
-
-    The real one has the identified parameters of the makers' design A.0 with Coulomb friction, f_p
-    masses and inertias that are 15 % off, and no friction. At most 10 N m, held for 0.05 s, an
-    episode of 2 s.
-    """
-    return PENDUBOT.system(physics)
+The real one has the identified parameters of the makers' design A.0 with Coulomb friction, f_p
+masses and inertias that are 15 % off, and no friction. At most 10 N m, held for 0.05 s, an episode
+of 2 s.
+"""
 
 
 def tanks_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
@@ -226,22 +214,17 @@ TANKS = Machine(
     episode_length=30,
     bounds=([-1.0] * 3, [15.0] * 3),  # the tanks' height
 )  # fmt: skip
+"""Two tanks below each other, whose lower level is to come to a set-point of the episode.
+
+The pump of the real one loses against the pressure, and the tanks can flow over; f_p lacks both,
+and its flows are 25 to 33 % too strong. At most 10 V, held for 5 s, an episode of 150 s.
+"""
 
 
-def tanks(physics: Physics = "crude") -> System:
-    """Two tanks below each other, whose lower level is to come to a set-point of the episode.
-
-    The pump of the real one loses against the pressure, and the tanks can flow over; f_p lacks
-    both, and its flows are 25 to 33 % too strong. At most 10 V, held for 5 s, an episode of 150 s.
-    """
-    return TANKS.system(physics)
-
-
-SYSTEMS: Mapping[str, Callable[[Physics], System]] = {
-    "pendulum": pendulum,
-    "furuta": furuta,
-    "quadrotor": quadrotor,
-    "double_pendulum": double_pendulum,
-    "tanks": tanks,
+MACHINES = {
+    "pendulum": PENDULUM,
+    "furuta": FURUTA,
+    "quadrotor": QUADROTOR,
+    "double_pendulum": PENDUBOT,
+    "tanks": TANKS,
 }
-"""The systems, by their names."""

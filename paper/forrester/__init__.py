@@ -18,16 +18,11 @@ OTHER = "other settings"  # the paper's protocol with other steps of Adam and no
 class Forrester(Experiment):
     """Seven models learn Forrester's function (figure 1), by two protocols of training."""
 
-    runs: int = 100
-    """data sets; the number is the seed"""
-    observations: int = 8
-    """noise-free observations of a data set"""
-    noise: float = 0.01
-    """the fixed noise variance of the paper's protocol, and its ridge"""
-    steps: int = 50
-    """of Adam, in the paper's protocol"""
-    rate: float = 0.1
-    """of Adam, in the paper's protocol"""
+    runs: int = 100  # data sets; the number is the seed
+    observations: int = 8  # noise-free observations of a data set
+    noise: float = 0.01  # the fixed noise variance of the paper's protocol, and its ridge
+    steps: int = 50  # of Adam, in the paper's protocol
+    rate: float = 0.1  # of Adam, in the paper's protocol
     lengthscales: tuple[float, ...] = (0.2, 0.3, 0.5, 0.7, 1.0, 1.5)
     """of the literal closed form of RRA, on a grid"""
     ridges: tuple[float, ...] = (1e-6, 1e-4, 1e-2, 1.0)
@@ -36,6 +31,7 @@ class Forrester(Experiment):
     axes: ClassVar[Axes] = {"reading": READINGS, "protocol": PROTOCOLS | {GRID: GRID, OTHER: OTHER}}
     calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.RRA")
     curves: ClassVar[tuple[str, ...]] = ("B", "paper")
+    digits: ClassVar[int] = 5
     quick: ClassVar[Mapping[str, Any]] = {}
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:

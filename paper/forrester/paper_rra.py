@@ -58,9 +58,9 @@ class PaperConditioning(Conditioning):
 
     wide: Conditioning
 
-    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+    def moments(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and variances at each point."""
-        return self.mean(sought)[0], self.wide.marginals(sought)[1]
+        return self.mean(sought)[0], self.wide.moments(sought)[1]
 
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and covariances."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,20 +18,21 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gpadjust import CalibratedPhysics, fit
-from gpadjust.core import SamplingWarning
 from gpadjust.validation import score
-from paper.common.experiment import Run, Table
+from paper.common.experiment import Run, Table, fitted
 from paper.common.figures import panels, save
 from paper.common.learners import LEARNERS
-from paper.common.tables import Cell, groups, number, table
+from paper.common.tables import Cell, frame, groups, of, ratio_of, table
 from paper.common.verdicts import Difference, paired
 from paper.functions import GROUPS, Functions
+from paper.functions import PROBLEMS as NAMES
 from paper.functions.problems import PROBLEMS
 from paper.parameters.laws import case
 
 MOST, TOO_MUCH = 1.05, 1.3  # of the formula's error
-_CELL = ["group", "problem", "n"]
+_CELL = ["problem", "n"]
+_GROUP = {name: group for group, names in NAMES.items() for name in names}
+LAWS = NAMES["law"]
 
 
 class Data(NamedTuple):
@@ -46,14 +46,14 @@ class Data(NamedTuple):
     new: Tensor
 
 
-def data_of(group: str, name: str, n: int, num_test: int, seed: int) -> Data:
+def data_of(name: str, n: int, num_test: int, seed: int) -> Data:
     """The data set that a seed draws."""
     generator = torch.Generator().manual_seed(seed)
 
     def noisy(f: Tensor, sd: Any) -> Tensor:
         return f + sd * torch.randn(f.shape, generator=generator, dtype=torch.float64)
 
-    if group == "law":
+    if name in LAWS:
         drawn, test = case(name, seed, n), case(name, seed, num_test, places=1)
         physics, noise = drawn.physics, drawn.noise
         return Data(drawn.X, drawn.Y, physics, test.X, test.system, noisy(test.system, noise))
@@ -65,28 +65,23 @@ def data_of(group: str, name: str, n: int, num_test: int, seed: int) -> Data:
     return Data(X, Y, problem.physics, points, truth, noisy(truth, sd))
 
 
-def run(experiment: Functions, group: str, problem: str, n: int, learner: str, seed: int) -> Run:
+def run(experiment: Functions, problem: str, n: int, learner: str, seed: int) -> Run:
     """Fit a learner to a data set; return its error, its density and what its intervals hold."""
-    warnings.simplefilter("ignore", SamplingWarning)
-    data = data_of(group, problem, n, experiment.num_test, seed)
+    data = data_of(problem, n, experiment.num_test, seed)
     sd, begin = data.truth.std(), time.perf_counter()
-    if learner == "formula" and group != "law":
+    if learner == "formula" and problem not in LAWS:
         error = _least_squares(data) - data.truth
         seconds = time.perf_counter() - begin
         return {"error": (error.square().mean().sqrt() / sd).item(), "seconds": seconds}
-    make: Any = CalibratedPhysics if learner == "formula" else LEARNERS[learner].make
-    model = make(data.X, data.Y, physics=data.physics)
-    fit(model)
-    seconds = time.perf_counter() - begin
+    model = LEARNERS[learner].make(data.X, data.Y, physics=data.physics)
+    seconds = fitted(model)
     with torch.no_grad():
-        mean, (low, high) = model.predict(data.points).mean, model.interval(data.points)
+        mean = model.predict(data.points).mean
         scores = score(model.posterior(data.points, observation_noise=True), data.new)
-    inside = (low <= data.truth) & (data.truth <= high)
     return {
         "error": ((mean - data.truth).square().mean().sqrt() / sd).item(),
         "nlpd": (scores.nlpd - sd.log()).item(),
         "coverage": scores.coverage.item(),
-        "of_function": inside.double().mean().item(),
         "seconds": seconds,
     }
 
@@ -101,21 +96,20 @@ def _least_squares(data: Data) -> Tensor:
 
 def tables(runs: Sequence[Run], experiment: Functions) -> dict[str, Table]:
     """All tables, by name."""
-    found = pd.DataFrame(runs)
-    parts = groups(found, "group", GROUPS) | {"all": found}
-    worse = {
+    learners, parts = experiment.axes["learner"], _grouped(runs)
+    found = parts["all"] = pd.concat(parts.values())
+    worse: dict[str, Cell] = {
         "cells": lambda part: len(_ratios(part, "formula")),
-        "error, CKA / formula fitted": lambda part: _pooled(part, "formula"),
-        "median cell": lambda part: _median(part, "formula"),
-        f"cells at most {MOST}": lambda part: _share(part, "formula", MOST),
+        "error, CKA / formula fitted": _pooled("formula"),
+        "median cell": _median("formula"),
+        f"cells at most {MOST}": _share,
         f"cells above {TOO_MUCH}": lambda part: sum(
             each.mean > math.log(TOO_MUCH) for each in _ratios(part, "formula").values()
         ),
         "worst cell": _worst,
     }
-    learners = experiment.axes["learner"]
     each = {
-        f"{label}: {what}": _of(name, column, how, form)
+        f"{label}: {what}": of(column, how, form, learner=name)
         for column, what, how, form in (
             ("error", "median error / sd", "median", ".2g"),
             ("coverage", "95 % hold", "mean", ".3f"),
@@ -129,17 +123,18 @@ def tables(runs: Sequence[Run], experiment: Functions) -> dict[str, Table]:
         "cells": lambda part: len(_ratios(part, "phymean")),
         "CKA better": lambda part: sum(e.high < 0 for e in _ratios(part, "phymean").values()),
         "CKA worse": lambda part: sum(e.low > 0 for e in _ratios(part, "phymean").values()),
-        "error, CKA / physics mean": lambda part: _pooled(part, "phymean"),
-        "median cell": lambda part: _median(part, "phymean"),
-        "error, CKA / GP": lambda part: _pooled(part, "gp"),
-        "median cell, GP": lambda part: _median(part, "gp"),
+        "error, CKA / physics mean": _pooled("phymean"),
+        "median cell": _median("phymean"),
+        "error, CKA / GP": _pooled("gp"),
+        "median cell, GP": _median("gp"),
     }
-    single: dict[str, Cell] = {
-        **{f"CKA / {learners[name]}": _beside(name) for name in ("formula", "phymean", "gp")},
-        "error / sd": _of("cka", "error", "median", ".2g"),
-        "95 % hold": _of("cka", "coverage", "mean", ".2f"),
+    single = {
+        f"CKA / {learners[name]}": ratio_of("error", "cka", name)
+        for name in ("formula", "phymean", "gp")
     }
-    cells = groups(found, _CELL, lambda group, name, n: f"{name}, {n}")
+    single["error / sd"] = of("error", "median", ".2g", learner="cka")
+    single["95 % hold"] = of("coverage", "mean", ".2f", learner="cka")
+    cells = groups(found, _CELL, "{}, {}".format)
     return {
         "formula": Table("CKA beside its formula, fitted", table(parts, worse, "the formula is")),
         "learners": Table("All learners", table(parts, each, "the formula is")),
@@ -148,12 +143,9 @@ def tables(runs: Sequence[Run], experiment: Functions) -> dict[str, Table]:
     }
 
 
-def _of(learner: str, column: str, how: str, form: str) -> Cell:
-    return lambda part: number(part[part["learner"] == learner][column].agg(how), form)
-
-
-def _beside(other: str) -> Cell:
-    return lambda part: paired(part, "error", "learner", "cka", other, ratio=True).ratio()
+def _grouped(runs: Sequence[Run]) -> dict[str, pd.DataFrame]:
+    found = frame(runs)
+    return groups(found.assign(group=found["problem"].map(_GROUP)), "group", GROUPS)
 
 
 def _ratios(part: pd.DataFrame, other: str) -> dict[tuple[Any, ...], Difference]:
@@ -165,17 +157,20 @@ def _ratios(part: pd.DataFrame, other: str) -> dict[tuple[Any, ...], Difference]
     return {cell: each for cell, each in cells.items() if each.n}
 
 
-def _pooled(part: pd.DataFrame, other: str) -> str:
-    return Difference.of([each.mean for each in _ratios(part, other).values()]).ratio()
+def _pooled(other: str) -> Cell:
+    return lambda part: Difference.of([e.mean for e in _ratios(part, other).values()]).ratio()
 
 
-def _median(part: pd.DataFrame, other: str) -> str:
-    middle = np.median([each.mean for each in _ratios(part, other).values()] or [np.nan])
-    return number(math.exp(middle), ".2f")
+def _median(other: str) -> Cell:
+    def cell(part: pd.DataFrame) -> str:
+        means = [each.mean for each in _ratios(part, other).values()]
+        return f"{math.exp(np.median(means)):.2f}" if means else ""
+
+    return cell
 
 
-def _share(part: pd.DataFrame, other: str, most: float) -> str:
-    held = [each.mean <= math.log(most) for each in _ratios(part, other).values()]
+def _share(part: pd.DataFrame) -> str:
+    held = [each.mean <= math.log(MOST) for each in _ratios(part, "formula").values()]
     return f"{sum(held)} of {len(held)}"
 
 
@@ -184,13 +179,12 @@ def _worst(part: pd.DataFrame) -> str:
     if not found:
         return ""
     cell = max(found, key=lambda cell: found[cell].mean)
-    return f"{math.exp(found[cell].mean):.2f}, {cell[1]}, n = {cell[2]}"
+    return f"{math.exp(found[cell].mean):.2f}, {cell[0]}, n = {cell[1]}"
 
 
 def draw(runs: Sequence[Run], experiment: Functions) -> list[Path]:
     """Draw the ratio of each cell to the formula, sorted, with its interval, by group."""
-    found = pd.DataFrame(runs)
-    parts = groups(found, "group", GROUPS)
+    parts = _grouped(runs)
     figure, axes = panels([*parts], 3, (3.2, 2.8))
     for ax, part in zip(axes, parts.values(), strict=True):
         order = sorted(_ratios(part, "formula").values(), key=lambda each: each.mean)

@@ -20,19 +20,12 @@ Function = Callable[[Tensor], Tensor]
 
 
 class Problem(NamedTuple):
-    """A function and a formula for it.
+    """A function and a formula for it."""
 
-    Attributes:
-        num_inputs: Number ``d`` of inputs, in [0, 1].
-        truth: Maps ``n x d`` to ``n x 1``.
-        physics: The same.
-        noise: Standard deviation of observations, in that of the function.
-    """
-
-    num_inputs: int
-    truth: Function
-    physics: Function
-    noise: float = 0.0
+    num_inputs: int  # number `d` of inputs, in [0, 1]
+    truth: Function  # maps `n x d` to `n x 1`
+    physics: Function  # the same
+    noise: float = 0.0  # standard deviation of observations, in that of the function
 
     def points(self, n: int, seed: int) -> Tensor:
         """The first points of a scrambled Sobol sequence, ``n x d``."""

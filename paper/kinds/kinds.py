@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,15 +18,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gpadjust import (
-    CKA,
-    EmulatedPhysics,
-    FunctionPhysics,
-    PhysicsMeanGP,
-    Unknown,
-    fit,
-)
-from gpadjust.core import SamplingWarning
+from gpadjust import CKA, EmulatedPhysics, FunctionPhysics, PhysicsMeanGP, Unknown
 from gpadjust.kinds import (
     Categories,
     HeavyTails,
@@ -37,11 +28,10 @@ from gpadjust.kinds import (
     Vanishing,
     Window,
 )
-from gpadjust.physics import PhysicsWarning
-from paper.common.experiment import Run, Table
+from paper.common.experiment import Run, Table, fitted
 from paper.common.figures import panels, save
-from paper.common.tables import Cell, groups, number, table
-from paper.common.verdicts import paired
+from paper.common.tables import Cell, frame, groups, of, ratio_of, table
+from paper.common.verdicts import scores_of
 from paper.functions.problems import PROBLEMS
 from paper.kinds import Kinds
 
@@ -50,33 +40,18 @@ _LINE = 61  # points of a picture
 
 
 class Predicted(NamedTuple):
-    """Predictions of a learner.
+    """Predictions of a learner."""
 
-    Attributes:
-        mean: Means ``n x 1``, or medians, in units in which errors count.
-        low: Lower ends of 95 % intervals.
-        high: Upper ends.
-        truth: True values, or measured ones.
-        lines: For a picture: ``x``, ``truth``, ``low`` and ``high`` along a line, and the ``data``.
-        seconds: Of the fit.
-    """
-
-    mean: Tensor
-    low: Tensor
-    high: Tensor
-    truth: Tensor
+    mean: Tensor  # means `n x 1`, or medians, in units in which errors count
+    low: Tensor  # lower ends of 95 % intervals
+    high: Tensor  # upper ends
+    truth: Tensor  # true values, or measured ones
+    # For a picture, if any: `x`, `truth`, `low` and `high` along a line, and data.
     lines: dict[str, Tensor]
-    seconds: float
+    seconds: float  # of the fit
 
 
-def _fitted(model: Any, seed: int = 0) -> float:
-    """Fit a model; return the seconds."""
-    begin = time.perf_counter()
-    fit(model, seed=seed)
-    return time.perf_counter() - begin
-
-
-def _at(model: Any, test: Tensor, truth: Tensor, line: Tensor, data: Any, **more: Any) -> Predicted:
+def _at(model: Any, test: Tensor, truth: Tensor, line: Tensor, data: Any) -> Predicted:
     """Fit a model, and predict the function at test points and along a line.
 
     Args:
@@ -85,16 +60,14 @@ def _at(model: Any, test: Tensor, truth: Tensor, line: Tensor, data: Any, **more
         truth: The truth there, ``n x 1``.
         line: Points of a picture, and the truth there, as its last column.
         data: Inputs and outputs of the picture.
-        more: ``column`` of the input that the picture has, if not the first.
     """
-    seconds = _fitted(model)
-    points, of_line, x = line[:, :-1], line[:, -1:], line[:, more.get("column", 0)]
+    seconds = fitted(model)
     with torch.no_grad():
-        mean, (low, high) = model.predict(test).mean, model.interval(test)
-        ends = model.interval(points)
-    lines = {"x": x, "truth": of_line, "low": ends[0], "high": ends[1]}
-    lines |= {"data_x": data[0][:, more.get("column", 0)], "data_y": data[1]}
-    return Predicted(mean, low, high, truth, lines, seconds)
+        low, high = model.interval(line[:, :-1])
+        mean, ends = model.predict(test).mean, model.interval(test)
+    lines = {"x": line[:, 0], "truth": line[:, -1:], "low": low, "high": high}
+    lines |= {"data_x": data[0][:, 0], "data_y": data[1]}
+    return Predicted(mean, ends[0], ends[1], truth, lines, seconds)
 
 
 def _line(function: Callable[[Tensor], Tensor], low: float = 0.0, high: float = 1.0) -> Tensor:
@@ -224,22 +197,20 @@ def drift(option: bool, seed: int) -> Predicted:
     model: Any = CKA(
         X[:first], Y[:first], physics=lambda X: 40 * X[..., 1:] ** 2 - 18 * X[..., :1] ** 2
     )
-    seconds = _fitted(model)
+    seconds = fitted(model)
     if not option:
-        parts = [model.predict(X[first:]).mean, *model.interval(X[first:])]
+        mean, (low, high) = model.predict(X[first:]).mean, model.interval(X[first:])
     else:
         begin, rows, window = time.perf_counter(), [], Window(model, first)
-        for i in range(first, steps):
-            x, y = X[i : i + 1], Y[i : i + 1]
+        for x, y in zip(X[first:].split(1), Y[first:].split(1), strict=True):
             rows.append([window.predict(x).mean, *window.interval(x)])
             window.update(x, y)
-        parts = [torch.cat(column) for column in zip(*rows, strict=True)]
+        mean, low, high = (torch.cat(column) for column in zip(*rows, strict=True))
         seconds += time.perf_counter() - begin
     after = torch.arange(first, steps).double()
-    lines = {"x": after, "truth": truth[first:] - parts[0]}
-    lines |= {"low": parts[1] - parts[0], "high": parts[2] - parts[0]}
-    lines |= {"data_x": after, "data_y": Y[first:] - parts[0]}
-    return Predicted(parts[0], parts[1], parts[2], truth[first:], lines, seconds)
+    lines = {"truth": truth[first:], "low": low, "high": high, "data_y": Y[first:]}
+    lines = {name: line - mean for name, line in lines.items()} | {"x": after, "data_x": after}
+    return Predicted(mean, low, high, truth[first:], lines, seconds)
 
 
 def vanishing(option: bool, seed: int) -> Predicted:
@@ -268,14 +239,13 @@ def emulated(option: bool, seed: int) -> Predicted:
     """Currin's function; its low level is known by 40 runs. Plain: their emulator is exact."""
     problem = PROBLEMS["currin"]
     X, runs = problem.points(10, seed), problem.points(40, 20_000 + seed)
-    low = EmulatedPhysics(runs, problem.physics(runs))
+    known = EmulatedPhysics(runs, problem.physics(runs))
     test = problem.points(400, 1)
-    physics = low if option else FunctionPhysics(low)
-    line = torch.full((_LINE, 2), 0.5, dtype=torch.float64)
-    line[:, 0] = torch.linspace(0, 1, _LINE)
-    line = torch.cat([line, problem.truth(line)], -1)
+    physics = known if option else FunctionPhysics(known)
     model = CKA(X, problem.truth(X), physics=physics)
-    return _at(model, test, problem.truth(test), line, (X[:0], X[:0, :1]))
+    seconds = fitted(model)
+    low, high = model.interval(test)
+    return Predicted(model.predict(test).mean, low, high, problem.truth(test), {}, seconds)
 
 
 _UNKNOWNS = {"C_D": Unknown(1.1, bounds=(0.2, 2.0)), "g": Unknown(10.0, bounds=(8.0, 12.0))}
@@ -294,16 +264,13 @@ def balldrop(option: bool, seed: int) -> Predicted:
     Data, runs and priors are those of the documentation of SEPIA (lanl/SEPIA at 3098904, notebook
     `ball_drop_2`). Plain: their formula with guesses of drag and gravity, adjusted by CKA.
     """
-    field, design = pd.read_csv(DATA / "field.csv"), pd.read_csv(DATA / "design.csv").head(80)
-    times, heights = pd.read_csv(DATA / "runs.csv").to_numpy(), range(10, 61, 10)
-    rows = [[d.R_ball, d.rho_ball, h, d.C_D, d.g] for d in design.itertuples() for h in heights]
-    outputs = [[times[h, i]] for i in range(len(design)) for h in heights]
+    field, runs = pd.read_csv(DATA / "field.csv"), pd.read_csv(DATA / "runs.csv")
+    inputs = runs[["R_ball", "rho_ball", "height", "C_D", "g"]].to_numpy(float)
+    times = runs[["time"]].to_numpy(float)
     begin = time.perf_counter()
     physics: Any = _drop_time
     if option:
-        physics = EmulatedPhysics(
-            np.array(rows), np.array(outputs), unknowns=_UNKNOWNS, fit_options={"seed": seed}
-        )
+        physics = EmulatedPhysics(inputs, times, unknowns=_UNKNOWNS, fit_options={"seed": seed})
     seconds = time.perf_counter() - begin
     X, Y, sd = (
         torch.from_numpy(field[columns].to_numpy(dtype=float, copy=True))
@@ -312,28 +279,20 @@ def balldrop(option: bool, seed: int) -> Predicted:
     out = X[:, 0] == _SOFTBALL
     structure: Any = PhysicsMeanGP if option else CKA
     model = structure(X[~out], Y[~out], sd[~out].square(), physics=physics)
-    seconds += _fitted(model, seed)
+    seconds += fitted(model, seed=seed)
     height = torch.linspace(10, 60, _LINE, dtype=torch.float64)[:, None]
     ball = torch.cat([X[out][:1, :2].repeat(_LINE, 1), height], -1)
-    with torch.no_grad():
-        parts = [model.predict(X[out]).mean, *model.interval(X[out], observation_noise=True)]
-        ends, mean = model.interval(ball), model.predict(ball).mean
-    lines = {"x": height, "truth": mean, "low": ends[0], "high": ends[1]}
+    mean, ends = model.predict(X[out]).mean, model.interval(ball)
+    low, high = model.interval(X[out], observation_noise=True)
+    lines = {"x": height, "truth": model.predict(ball).mean, "low": ends[0], "high": ends[1]}
     lines |= {"data_x": X[out][:, 2], "data_y": Y[out]}
-    return Predicted(parts[0], parts[1], parts[2], Y[out], lines, seconds)
+    return Predicted(mean, low, high, Y[out], lines, seconds)
 
 
-KINDS: Mapping[str, Callable[[bool, int], Predicted]] = {
-    "relative": relative,
-    "outliers": outliers,
-    "noisy_inputs": noisy_inputs,
-    "links": links,
-    "categories": categories,
-    "drift": drift,
-    "vanishing": vanishing,
-    "emulated": emulated,
-    "balldrop": balldrop,
-}
+KINDS = {
+    kind.__name__: kind
+    for kind in (relative, outliers, noisy_inputs, links, categories, drift, vanishing, emulated)
+} | {"balldrop": balldrop}
 OPTIONS = {
     "relative": ("CKA", "noise=RelativeNoise()"),
     "outliers": ("CKA", "noise=HeavyTails()"),
@@ -350,52 +309,41 @@ OPTIONS = {
 
 def run(experiment: Kinds, kind: str, learner: str, seed: int) -> Run:
     """Fit a learner to a data set of a kind; return error and coverage where the truth is known."""
-    for category in (SamplingWarning, PhysicsWarning):
-        warnings.simplefilter("ignore", category)
     found = KINDS[kind](learner == "option", 500 + seed)
-    off = found.mean - found.truth
-    inside = (found.low <= found.truth) & (found.truth <= found.high)
+    scores = scores_of(found.mean, found.low, found.high, found.truth)
     results: Run = {
-        "error": off.square().mean().sqrt().item(),
-        "coverage": inside.double().mean().item(),
-        "width": (found.high - found.low).mean().item(),
+        "error": scores["rmse"],
+        "coverage": scores["coverage"],
         "seconds": found.seconds,
     }
-    if seed == experiment.seed:
+    if seed == experiment.seed and found.lines:
         results["lines"] = {name: part.flatten().tolist() for name, part in found.lines.items()}
     return results
 
 
 def tables(runs: Sequence[Run], experiment: Kinds) -> dict[str, Table]:
     """A row for each kind."""
-    found = pd.DataFrame([{k: v for k, v in run.items() if k != "lines"} for run in runs])
-
-    def of(column: str, learner: str, how: str, form: str) -> Cell:
-        return lambda part: number(part[part["learner"] == learner][column].agg(how), form)
-
-    def ratio(part: pd.DataFrame) -> str:
-        return paired(part, "error", "learner", "option", "plain", ratio=True).ratio()
-
-    def better(part: pd.DataFrame) -> str:
-        wide = part.pivot_table(index="seed", columns="learner", values="error").dropna()
-        if len(wide.columns) < 2:
-            return ""
-        return f"{(wide['option'] < wide['plain']).sum()} of {len(wide)}"
-
     columns: dict[str, Cell] = {
         "plain": lambda part: OPTIONS[part["kind"].iloc[0]][0],
         "option": lambda part: f"`{OPTIONS[part['kind'].iloc[0]][1]}`",
-        "median error, plain": of("error", "plain", "median", ".2g"),
-        "median error, option": of("error", "option", "median", ".2g"),
-        "error, option / plain": ratio,
-        "option better": better,
-        "95 % hold, plain": of("coverage", "plain", "mean", ".2f"),
-        "95 % hold, option": of("coverage", "option", "mean", ".2f"),
-        "seconds, plain": of("seconds", "plain", "median", ".1f"),
-        "seconds, option": of("seconds", "option", "median", ".1f"),
+        "median error, plain": of("error", "median", ".2g", learner="plain"),
+        "median error, option": of("error", "median", ".2g", learner="option"),
+        "error, option / plain": ratio_of("error", "option", "plain"),
+        "option better": _better,
+        "95 % hold, plain": of("coverage", "mean", ".2f", learner="plain"),
+        "95 % hold, option": of("coverage", "mean", ".2f", learner="option"),
+        "seconds, plain": of("seconds", "median", ".1f", learner="plain"),
+        "seconds, option": of("seconds", "median", ".1f", learner="option"),
     }
-    text = table(groups(found, "kind", experiment.axes["kind"]), columns, "data")
+    text = table(groups(frame(runs), "kind", experiment.axes["kind"]), columns, "data")
     return {"kinds": Table("Each kind of data, by its option and by plain CKA", text)}
+
+
+def _better(part: pd.DataFrame) -> str:
+    wide = part.pivot_table(index="seed", columns="learner", values="error").dropna()
+    if len(wide.columns) < 2:
+        return ""
+    return f"{(wide['option'] < wide['plain']).sum()} of {len(wide)}"
 
 
 _LOGARITHMIC = ("relative", "links")
@@ -410,26 +358,26 @@ _AXES = {
 
 def draw(runs: Sequence[Run], experiment: Kinds) -> list[Path]:
     """Draw the first data set of each kind, a picture for each: intervals by both learners."""
-    files = []
-    for kind in experiment.axes["kind"]:
-        shown = {
-            run["learner"]: run["lines"] for run in runs if run["kind"] == kind and "lines" in run
-        }
-        if len(shown) < 2:
-            continue
-        figure, axes = panels([*OPTIONS[kind]], 2, (4.3, 3.0))
-        for ax, learner, color in zip(axes, ("plain", "option"), ("0.5", "#D55E00"), strict=True):
-            of = {name: np.array(values) for name, values in shown[learner].items()}
-            least = 1e-9 if kind in _LOGARITHMIC else -np.inf
-            ax.fill_between(of["x"], of["low"].clip(least), of["high"], color=color, alpha=0.4,
-                            lw=0, label="95 %")  # fmt: skip
-            ax.plot(of["x"], of["truth"], color="0.1", lw=1, label="truth")
-            ax.plot(of["data_x"], of["data_y"], ".", color="#0072B2", ms=4, label="observations")
-            if kind in _LOGARITHMIC:
-                low = min(of["truth"].min(), of["data_y"].clip(1e-9).min())
-                ax.set(yscale="log", ylim=(0.3 * low, 5 * of["truth"].max()))
-            x, y = _AXES.get(kind, ("input", "output"))
-            ax.set(xlabel=x, ylabel=y)
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
-        files.append(save(figure, experiment.folder / f"{kind}.png"))
-    return files
+    first = [run for run in runs if "lines" in run]
+    pairs = {
+        kind: {run["learner"]: run["lines"] for run in first if run["kind"] == kind}
+        for kind in experiment.axes["kind"]
+    }
+    return [_drawn(kind, pair, experiment.folder) for kind, pair in pairs.items() if len(pair) == 2]
+
+
+def _drawn(kind: str, pair: dict[str, dict[str, list[float]]], folder: Path) -> Path:
+    figure, axes = panels([*OPTIONS[kind]], 2, (4.3, 3.0))
+    for ax, learner, color in zip(axes, ("plain", "option"), ("0.5", "#D55E00"), strict=True):
+        line = {name: np.array(values) for name, values in pair[learner].items()}
+        low = line["low"].clip(1e-9) if kind in _LOGARITHMIC else line["low"]
+        ax.fill_between(line["x"], low, line["high"], color=color, alpha=0.4, lw=0, label="95 %")
+        ax.plot(line["x"], line["truth"], color="0.1", lw=1, label="truth")
+        ax.plot(line["data_x"], line["data_y"], ".", color="#0072B2", ms=4, label="observations")
+        if kind in _LOGARITHMIC:
+            least = min(line["truth"].min(), line["data_y"].clip(1e-9).min())
+            ax.set(yscale="log", ylim=(0.3 * least, 5 * line["truth"].max()))
+        x, y = _AXES.get(kind, ("input", "output"))
+        ax.set(xlabel=x, ylabel=y)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return save(figure, folder / f"{kind}.png")

@@ -18,12 +18,9 @@ _DYNAMICS = ("gpadjust.dynamics.LearnedDynamics", "gpadjust.dynamics.Dynamics.fr
 class Real(Experiment):
     """Dynamics learnt from some transitions of a real pendulum, scored at other records."""
 
-    runs: int = 3
-    """draws of the transitions"""
-    windows: int = 80
-    """free runs of a test, from evenly spread states, the same for all learners"""
-    num_functions: int = 39
-    """particles of a free run"""
+    runs: int = 3  # draws of the transitions
+    windows: int = 80  # free runs of a test, from evenly spread states, the same for all learners
+    num_functions: int = 39  # particles of a free run
 
     axes: ClassVar[Axes] = {
         "system": {"double-pendulum": "double pendulum", "pendulum": "torque-limited pendulum"},
@@ -79,20 +76,13 @@ of those with a linear sensor.
 class Tanks(Experiment):
     """Dynamics of two tanks, learnt from one record, by a free run along another one."""
 
-    runs: int = 3
-    """draws of the smoothed states; f_p alone has one run"""
-    samples: int = 1024
-    """of each record, the first ones"""
-    transitions: int = 400
-    """that GPs learn from"""
-    noise: float = 0.15
-    """standard deviation of the measured level in V"""
-    starts: int = 2
-    """of each fit of f_p"""
-    rounds: int = 100
-    """of each start, at most"""
-    num_functions: int = 39
-    """particles of a free run"""
+    runs: int = 3  # draws of the smoothed states; f_p alone has one run
+    samples: int = 1024  # of each record, the first ones
+    transitions: int = 400  # that GPs learn from
+    noise: float = 0.15  # standard deviation of the measured level in V
+    starts: int = 2  # of each fit of f_p
+    rounds: int = 100  # of each start, at most
+    num_functions: int = 39  # particles of a free run
 
     axes: ClassVar[Axes] = {
         "sensor": {"kink": "kinked sensor", "overflow": "linear sensor", "none": "no f_p"},
@@ -104,10 +94,9 @@ class Tanks(Experiment):
         },
     }
     calls: ClassVar[tuple[str, ...]] = (*_DYNAMICS, "gpadjust.records.smooth")
+    single: ClassVar[tuple[str, ...]] = ("fitted",)
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """One run of f_p alone."""
+        """Without f_p those of the GP alone."""
         sensor, learner = kind
-        if (sensor == "none") != (learner == "gp"):
-            return ()
-        return self.seeds[:1] if learner == "fitted" else self.seeds
+        return () if (sensor == "none") != (learner == "gp") else super().seeds_of(*kind)

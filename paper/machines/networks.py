@@ -13,6 +13,8 @@ from gpadjust.dynamics import Dynamics, PhysicsDynamics, Trajectories, Transitio
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
 
+_HIDDEN = 32
+_RATE, _DECAY = 5e-3, 0.1  # of Adam
 _LOOK = 10  # steps of training between two looks at the rows that are held out
 
 
@@ -48,12 +50,9 @@ class NetworkDynamics(Dynamics):
     Args:
         spec: What the entries of states are.
         physics: f_p; None for networks alone.
-        number: How many networks.
-        hidden: The width of both hidden layers.
+        number: How many networks, of two hidden layers of 32.
         steps: The most steps of Adam.
-        rate: Its learning rate.
-        decay: Its weight decay.
-        seed: Of samples and weights; None for PyTorch's generator as it is.
+        seed: Of samples and weights.
     """
 
     def __init__(
@@ -62,16 +61,12 @@ class NetworkDynamics(Dynamics):
         physics: Physics | None = None,
         *,
         number: int = 10,
-        hidden: int = 32,
         steps: int = 1500,
-        rate: float = 5e-3,
-        decay: float = 0.1,
-        seed: int | None = 0,
+        seed: int = 0,
     ) -> None:
         super().__init__(spec)
         self.known = None if physics is None else PhysicsDynamics(spec, physics)
-        self.number, self.hidden, self.steps = number, hidden, steps
-        self.rate, self.decay, self.seed = rate, decay, seed
+        self.number, self.steps, self.seed = number, steps, seed
         self._read = [i for i, name in enumerate(spec.states) if name not in spec.exogenous]
         self._data: Trajectories | None = None
         self._networks: Networks | None = None
@@ -91,13 +86,12 @@ class NetworkDynamics(Dynamics):
         data = self._data = data if self._data is None else self._data.append(data)
         X, n = self._inputs(data.states, data.actions), len(data.states)
         rest = self.spec.change(data.states, data.next_states)[:, self.spec.predicted]
-        with torch.no_grad(), torch.random.fork_rng(devices=[], enabled=self.seed is not None):
-            if self.seed is not None:
-                torch.manual_seed(self.seed)
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
             rest = rest - self._physics(data.states, data.actions)
             self._units = X.mean(0), X.std(0).clamp_min(1e-6)
             self._shift, self._scale = rest.mean(0), rest.std(0).clamp_min(1e-9)
-            networks = Networks(self.number, X.shape[-1], self.hidden, rest.shape[-1])
+            networks = Networks(self.number, X.shape[-1], _HIDDEN, rest.shape[-1])
             fold = torch.randperm(n) % self.number
             shares = (fold != torch.arange(self.number)[:, None]).to(X)
         error = self._train(networks, X, (rest - self._shift) / self._scale, shares)
@@ -140,7 +134,7 @@ class NetworkDynamics(Dynamics):
     def _train(self, networks: Networks, X: Tensor, Y: Tensor, shares: Tensor) -> Tensor:
         """Train all networks at once; return the mean square of the errors, held out."""
         Z, held_out = self._normalized(X).expand(self.number, -1, -1), shares == 0
-        optimizer = torch.optim.AdamW(networks.parameters(), lr=self.rate, weight_decay=self.decay)
+        optimizer = torch.optim.AdamW(networks.parameters(), lr=_RATE, weight_decay=_DECAY)
         lowest = torch.full((self.number,), torch.inf, dtype=torch.float64)
         errors = torch.zeros_like(Y)
         kept = [weight.detach().clone() for weight in networks.parameters()]

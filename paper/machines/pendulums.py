@@ -17,6 +17,7 @@ STEP = 0.05  # s, of control
 SUBSTEPS = 10  # at 4 its RK4 comes near its limit: friction that sets in is stiff
 _GRAVITY = 9.81
 _GEAR = 6.0
+_LENGTH = 0.3  # m, of the first link
 _SLIDES = 0.05  # rad/s, at which Coulomb friction is three quarters of its value
 FRICTION = {
     "viscous": Unknown(0.01, factor=5.0, unit="N m s"),
@@ -30,19 +31,14 @@ Rates = Callable[[Tensor, Tensor, Mapping[str, Any]], Tensor]
 
 @dataclass(frozen=True)
 class Machine:
-    """A machine, and what was published of it.
+    """A machine, and what was published of it."""
 
-    Args:
-        spec: What states and actions are; the scores are of the last angle first of all.
-        rates: The equation of motion: the time derivatives ``N x state_dim`` of states
-            ``N x state_dim`` under actions ``N x action_dim``, with parameters by name, each
-            ``N`` or a number.
-        known: Parameters by what is known: ``"crude"``, as someone has them who knows the machine a
-            little, and ``"identified"``, by experiments.
-    """
-
-    spec: StateSpec
+    spec: StateSpec  # what states and actions are; the scores are of the last angle first of all
+    # The equation of motion: the time derivatives `N x state_dim` of states `N x state_dim`
+    # under actions `N x action_dim`, with parameters by name, each `N` or a number.
     rates: Rates
+    # Parameters by what is known: `"crude"`, as someone has them who knows the machine a little,
+    # and `"identified"`, by experiments.
     known: Mapping[str, Parameters]
 
     @property
@@ -76,18 +72,16 @@ def _friction(rate: Tensor, viscous: Any, coulomb: Any) -> Tensor:
     return viscous * rate + coulomb * (rate / _SLIDES).tanh()
 
 
-def double_pendulum(
-    state: Tensor, action: Tensor, p: Mapping[str, Any], length: float = 0.3
-) -> Tensor:
+def double_pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
     """Two links with geared drives, by the nine sums of masses that can be told apart.
 
     ``inertia_1`` is :math:`I_1 + m_2 l_1^2`, ``inertia_2`` :math:`I_2`, ``moment_1``
     :math:`m_1 r_1 + m_2 l_1` and ``moment_2`` :math:`m_2 r_2`, with inertias about the joints, and
-    ``rotor`` the inertia of a rotor. ``length`` is :math:`l_1` in m. Source: the makers'
-    ``docs/text/dynamics.rst``, but for the form of the friction.
+    ``rotor`` the inertia of a rotor. Source: the makers' ``docs/text/dynamics.rst``, but for the
+    form of the friction.
     """
     q1, q2, dq1, dq2 = state.unbind(-1)
-    coupling = length * p["moment_2"]
+    coupling = _LENGTH * p["moment_2"]
     across = p["inertia_2"] + coupling * q2.cos()
     whole = p["inertia_1"] + coupling * q2.cos() + across + (_GEAR**2 + 1) * p["rotor"]
     across = across - _GEAR * p["rotor"]
@@ -114,22 +108,21 @@ def pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
 
 
 def sums_of_masses(
-    first: tuple[float, float, float],
-    second: tuple[float, float, float],
-    length: float,
-    rotor: float,
-    friction: Parameters | None = None,
+    first: tuple[float, float, float], second: tuple[float, float, float], *friction: float
 ) -> Parameters:
-    """The parameters of a double pendulum from mass, inertia and center of mass of its links."""
+    """The parameters of a double pendulum from mass, inertia and center of mass of its links.
+
+    Friction is viscous and Coulomb of the first joint, then of the second.
+    """
     (mass_1, inertia_1, center_1), (mass_2, inertia_2, center_2) = first, second
-    frictions = ("viscous_1", "coulomb_1", "viscous_2", "coulomb_2")
+    names = ("viscous_1", "coulomb_1", "viscous_2", "coulomb_2")
     return {
-        "inertia_1": inertia_1 + mass_2 * length**2,
+        "inertia_1": inertia_1 + mass_2 * _LENGTH**2,
         "inertia_2": inertia_2,
-        "moment_1": mass_1 * center_1 + mass_2 * length,
+        "moment_1": mass_1 * center_1 + mass_2 * _LENGTH,
         "moment_2": mass_2 * center_2,
-        "rotor": rotor,
-        **(friction or dict.fromkeys(frictions, 0.0)),
+        "rotor": 7.66e-5,
+        **dict(zip(names, friction, strict=True)),
     }
 
 
@@ -141,25 +134,15 @@ DOUBLE_PENDULUM = Machine(
     double_pendulum,
     {
         "crude": sums_of_masses(
-            (0.85 * 0.5594, 0.85 * 0.05347, 0.3),
-            (1.15 * 0.6043, 1.15 * 0.02392, 0.1838),
-            0.3,
-            7.66e-5,
+            (0.85 * 0.5594, 0.85 * 0.05347, 0.3), (1.15 * 0.6043, 1.15 * 0.02392, 0.1838),
+            *(0.0, 0.0, 0.0, 0.0),
         ),
         "identified": sums_of_masses(
-            (0.5594, 0.05347, 0.3),
-            (0.6043, 0.02392, 0.1838),
-            0.3,
-            7.66e-5,
-            {
-                "viscous_1": 0.001,
-                "coulomb_1": 0.093 * math.pi / 2,
-                "viscous_2": 0.001,
-                "coulomb_2": 0.078 * math.pi / 2,
-            },
+            (0.5594, 0.05347, 0.3), (0.6043, 0.02392, 0.1838),
+            *(0.001, 0.093 * math.pi / 2, 0.001, 0.078 * math.pi / 2),
         ),
     },
-)
+)  # fmt: skip
 
 PENDULUM = Machine(
     StateSpec(["q", "dq"], ["u"], angles=["q"]),

@@ -3,99 +3,91 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
-from gpadjust.core import SamplingWarning
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, Windows
 from gpadjust.records import smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
 from paper.common.learners import LEARNERS
-from paper.common.tables import Cell, across, groups, number, table
-from paper.common.verdicts import Difference, paired
+from paper.common.tables import Cell, across, groups, mean_error, of, part_of, ratio_of, table
 from paper.machines import HORIZONS, Real
 from paper.machines.networks import NetworkDynamics
 from paper.machines.pendulums import STEP, Machine
 from paper.machines.records import REAL, System
 
-SCORES = {"rmse": ".3g", "coverage": ".2f"}
+SCORES = {"rmse": (".3g", ".1g"), "coverage": (".2f", ".2f")}
+"""With the forms of means and standard errors."""
+DRAWN = "double-pendulum"
 _TITLES = {"rmse": "RMSE of the last angle in rad", "coverage": "Coverage of 95 %"}
 _KEPT = 2  # free runs that are kept for a figure
 
 
-class Trained(NamedTuple):
-    """Dynamics, and standard deviations of what was measured if they learnt smoothed states."""
+def train(learner: str, known: System, n: int, seed: int) -> tuple[Dynamics, Tensor | None]:
+    """Learn from transitions of a machine, or from states that are smoothed along stretches.
 
-    dynamics: Dynamics
-    noise: Tensor | None = None
-
-
-def train(learner: str, machine: Machine, known: System, n: int, seed: int) -> Trained:
-    """Learn from transitions of a machine, or from states that are smoothed along stretches."""
+    Returns:
+        Dynamics, and standard deviations of what was measured if they learnt smoothed states.
+    """
     noise = None
     if learner.startswith("smoothed"):
-        smoothed = smooth(known.stretches(n, seed), machine.physics())
+        smoothed = smooth(known.stretches(n, seed), known.machine.physics())
         noise, data = smoothed.noise, smoothed.draw(seed).trajectories()
     else:
         data = known.drawn(n, seed)
-    dynamics = _dynamics(learner, machine, data, seed)
+    dynamics = _dynamics(learner, known.machine, data, seed)
     if learner != "phy":
         dynamics.update(*data)
-    return Trained(dynamics, noise)
+    return dynamics, noise
 
 
 def _dynamics(learner: str, machine: Machine, data: Any, seed: int) -> Dynamics:
     first, _, model = learner.partition("-")
+    spec, unknown = machine.spec, first in ("fitted", "calibrated", "smoothed")
+    physics = machine.physics("unknown" if unknown else "crude")
     if learner in ("phy", "fitted"):
-        return PhysicsDynamics(
-            machine.spec, machine.physics("crude" if learner == "phy" else "unknown")
-        )
+        return PhysicsDynamics(spec, physics)
     if learner == "residual":
-        return NetworkDynamics(machine.spec, machine.physics("crude"), seed=seed)
+        return NetworkDynamics(spec, physics, seed=seed)
     if learner == "phymean-fitted":
-        fitted = PhysicsDynamics(machine.spec, machine.physics())
+        fitted = PhysicsDynamics(spec, machine.physics())
         fitted.update(*data)
         found = fitted.physics_parameters
         physics = machine.physics(dict(zip(found, found.mean.tolist(), strict=True)))
-        return LearnedDynamics(machine.spec, physics, model=LEARNERS["phymean"].make)
-    unknown = first in ("calibrated", "smoothed")
-    names = {"": "calibrated", "delta": "phymean", "cka": "cka"}
-    known = LEARNERS[names[model] if unknown else learner]
-    physics = machine.physics("unknown" if unknown else "crude")
-    return LearnedDynamics(machine.spec, physics if known.adjusts else None, model=known.make)
+    made = LEARNERS[(model or "calibrated") if unknown else first]
+    return LearnedDynamics(spec, physics if made.adjusts else None, model=made.make)
 
 
 def run(experiment: Real, name: str, n: int, learner: str, seed: int) -> Run:
     """Learn, and return the scores of each test: by steps ahead, of each state."""
-    warnings.simplefilter("ignore", SamplingWarning)
     known = REAL[name]
     begin = time.perf_counter()
-    made = train(learner, known.machine, known, n, seed)
+    dynamics, noise = train(learner, known, n, seed)
     found: Run = {"fit_seconds": time.perf_counter() - begin, "tests": {}}
     for test in known.tests:
-        scores, free = _scores(made, known, test, experiment)
+        scores, free = _scores(dynamics, noise, known, test, experiment)
         found["tests"][test] = scores
-        if n == 100 and seed == 0 and learner in _SHOWN:
+        if name == DRAWN and n == 100 and seed == 0 and learner in _SHOWN:
             found.setdefault("paths", {})[test] = _paths(known, free)
     return found
 
 
-def _scores(made: Trained, known: System, test: str, experiment: Real) -> tuple[Any, Any]:
+def _scores(
+    dynamics: Dynamics, noise: Tensor | None, known: System, test: str, experiment: Real
+) -> tuple[Any, Any]:
     """Scores by name and steps ahead, and the free runs of which they are.
 
     Those of one step are of all steps of the test. If the noise of what is measured is known, the
     dynamics learnt process noise; else half of what they learnt is that of a state (the windows
     start at measured ones), and there is no process noise.
     """
-    dynamics, noise = made.dynamics, made.noise
     windows = known.windows(test, HORIZONS[-1], experiment.windows)
     given: dict[str, Any] = {"num_functions": experiment.num_functions, "start_noise": "learnt"}
     if noise is None:
@@ -132,9 +124,7 @@ def load(runs: Sequence[Run]) -> pd.DataFrame:
             row = {**shared, "test": test}
             for steps, values in scores["rmse"].items():
                 row[f"rmse-{steps}"] = values[angle]
-                row[f"coverage-{steps}"] = float(
-                    np.mean(np.array(scores["coverage"][steps], float))
-                )
+                row[f"coverage-{steps}"] = np.mean(np.array(scores["coverage"][steps], float))
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -144,37 +134,19 @@ def tables(runs: Sequence[Run], experiment: Real) -> dict[str, Table]:
     scored, axes = load(runs), experiment.axes
     found = {"paired": Table("n = 100, beside least squares by the same draws", _paired(scored))}
     for (name, test), own in scored.groupby(["system", "test"], sort=False):
-        for score, form in SCORES.items():
+        for score, forms in SCORES.items():
             for steps in (1, *HORIZONS):
-                cell = _drawn(f"{score}-{steps}", form)
+                cell = mean_error(f"{score}-{steps}", *forms, counted=True)
                 columns = across(own, "n", axes["n"], cell)
                 text = table(groups(own, "learner", axes["learner"]), columns, "learner")
                 title = f"{_TITLES[score]} after {_ahead(steps)}, {axes['system'][name]}, {test}"
                 found[f"{name}-{test}-{score}-{steps}"] = Table(title, text)
-    columns = {f"{label}, s": _seconds(name) for name, label in axes["system"].items()}
+    columns = {
+        f"{label}, s": of("fit_seconds", "median", ".1f", system=name, n=100)
+        for name, label in axes["system"].items()
+    }
     text = table(groups(scored, "learner", axes["learner"]), columns, "learner")
     return found | {"seconds": Table("Median seconds of a fit, n = 100", text)}
-
-
-def _seconds(system: str) -> Cell:
-    def cell(part: pd.DataFrame) -> str:
-        own = part[(part["system"] == system) & (part["n"] == 100)]
-        return number(own["fit_seconds"].median(), ".1f")
-
-    return cell
-
-
-def _drawn(column: str, form: str) -> Cell:
-    """The mean, its standard error, and of how many it is."""
-
-    def cell(part: pd.DataFrame) -> str:
-        found = Difference.of(part[column].astype(float))
-        if found.n < 2:
-            return number(found.mean, form)
-        error = f"{found.error:{'.1g' if form.endswith('g') else form}}"
-        return f"{found.mean:{form}} ± {error} ({found.n})"
-
-    return cell
 
 
 def _ahead(steps: int) -> str:
@@ -183,24 +155,22 @@ def _ahead(steps: int) -> str:
 
 def _paired(scored: pd.DataFrame) -> str:
     """Errors of n = 100 beside those of least squares, and of CKA beside its delta alone."""
-    at = scored[scored["n"] == 100]
+    at = part_of(scored, n=100)
     columns: dict[str, Cell] = {}
-    for name, test, steps in (
-        ("double-pendulum", "near", 20),
-        ("double-pendulum", "far", 20),
-        ("pendulum", "sac", 10),
-    ):
-        own = at[(at["system"] == name) & (at["test"] == test)]
-
-        def ratio(part: pd.DataFrame, own: pd.DataFrame = own, steps: int = steps) -> str:
-            learner = part["learner"].iloc[0]
-            if learner == "fitted":
-                return ""
-            given = (own, f"rmse-{steps}", "learner", learner, "fitted")
-            return paired(*given, ratio=True).ratio()
-
-        columns[f"{test}, {_ahead(steps)}: error / least squares"] = ratio
+    for name, test, steps in ((DRAWN, "near", 20), (DRAWN, "far", 20), ("pendulum", "sac", 10)):
+        own = part_of(at, system=name, test=test)
+        columns[f"{test}, {_ahead(steps)}: error / least squares"] = _ratio(own, steps)
     return table(groups(at, "learner", Real.axes["learner"]), columns, "learner")
+
+
+def _ratio(own: pd.DataFrame, steps: int) -> Cell:
+    def cell(part: pd.DataFrame) -> str:
+        learner = part["learner"].iloc[0]
+        if learner == "fitted":
+            return ""
+        return ratio_of(f"rmse-{steps}", learner, "fitted")(own)
+
+    return cell
 
 
 _SHOWN = ("fitted", "gp", "calibrated-delta", "smoothed-cka")
@@ -208,12 +178,11 @@ _SHOWN = ("fitted", "gp", "calibrated-delta", "smoothed-cka")
 
 def draw(runs: Sequence[Run], experiment: Real) -> list[Path]:
     """Draw free runs of the double pendulum: a row of panels for each learner."""
-    system = "double-pendulum"
-    kept = {r["learner"]: r["paths"] for r in runs if r["system"] == system and "paths" in r}
+    kept = {r["learner"]: r["paths"] for r in runs if r["system"] == DRAWN and "paths" in r}
     learners = [learner for learner in _SHOWN if learner in kept]
     if not learners:
         return []
-    known, labels = REAL[system], experiment.axes["learner"]
+    known, labels = REAL[DRAWN], experiment.axes["learner"]
     angle = known.machine.spec.angle_columns[-1]
     drawn = [(name, test, i) for name in learners for test in known.tests for i in range(_KEPT)]
     titles = [f"{labels[learner]}, {test}" for learner, test, _ in drawn]
@@ -234,4 +203,4 @@ def draw(runs: Sequence[Run], experiment: Real) -> list[Path]:
     figure.supxlabel("s", fontsize="medium")
     figure.supylabel("last angle, rad", fontsize="medium")
     one_legend(figure, axes)
-    return [save(figure, experiment.folder / f"{system}.png")]
+    return [save(figure, experiment.folder / f"{DRAWN}.png")]

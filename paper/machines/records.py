@@ -28,23 +28,14 @@ def folder_of(machine: str) -> Path:
 
 @dataclass(frozen=True)
 class System:
-    """Records of a machine, of which some are learnt from and others are tested at.
+    """Records of a machine, of which some are learnt from and others are tested at."""
 
-    Args:
-        machine: The machine.
-        folder: The machine, of :func:`folder_of`.
-        train: Files that are learnt from, without their endings.
-        tests: Files of each test, by its name.
-        segment: The column of segments.
-        moves: A rate in rad/s that what is tested at reaches.
-    """
-
-    machine: Machine
-    folder: str
-    train: tuple[str, ...]
-    tests: Mapping[str, tuple[str, ...]]
-    segment: str | None = None
-    moves: float = 0.0
+    machine: Machine  # the machine
+    folder: str  # the machine, of `folder_of`
+    train: tuple[str, ...]  # files that are learnt from, without their endings
+    tests: Mapping[str, tuple[str, ...]]  # files of each test, by its name
+    segment: str | None = None  # the column of segments
+    moves: float = 0.0  # a rate in rad/s that what is tested at reaches
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides what is learnt, in plain values."""
@@ -102,20 +93,15 @@ def _a(*numbers: str) -> tuple[str, ...]:
     return tuple(f"A0_20220815_{number}" for number in numbers)
 
 
-_DOUBLE = "double_pendulum"
-_PENDULUM: dict[str, Any] = {
-    "folder": "pendulum",
-    "train": ("energy_shaping",),
-    "segment": "segment",
-    "moves": _MOVES,
-}
 REAL = {
     "double-pendulum": System(
         DOUBLE_PENDULUM,
-        _DOUBLE,
+        "double_pendulum",
         _a("00", "02", "03"),
         {"near": _a("01", "12", "13"), "far": _a("04", "05")},
     ),
-    "pendulum": System(PENDULUM, **_PENDULUM, tests={"sac": ("sac",)}),
+    "pendulum": System(
+        PENDULUM, "pendulum", ("energy_shaping",), {"sac": ("sac",)}, "segment", _MOVES
+    ),
 }
 """The systems of the experiment ``real``, by name."""

@@ -15,18 +15,12 @@ PROBLEMS = ("moved peak", "moved ridge", "unrelated", "reactor", "column", "mixt
 class Misled(Experiment):
     """Bayesian optimisation with a physics that misleads, and with one that helps."""
 
-    seed: int = 500
-    """the first seed; 0 to 99 were for trying"""
-    initial: int = 5
-    """trials of a scrambled Sobol sequence, before a model is asked"""
-    trials: int = 15
-    """that follow, each at the optimum of qLogEI"""
-    restarts: int = 4
-    """of the optimisation of qLogEI"""
-    raw_samples: int = 128
-    """of the same"""
-    mc_samples: int = 64
-    """of qLogEI"""
+    seed: int = 500  # the first seed; 0 to 99 were for trying
+    initial: int = 5  # trials of a scrambled Sobol sequence, before a model is asked
+    trials: int = 15  # that follow, each at the optimum of qLogEI
+    restarts: int = 4  # of the optimisation of qLogEI
+    raw_samples: int = 128  # of the same
+    mc_samples: int = 64  # of qLogEI
 
     axes: ClassVar[Axes] = {
         "problem": {name: name for name in PROBLEMS},

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
 import torch
 from botorch.acquisition import qLogExpectedImprovement
@@ -23,7 +22,8 @@ from gpadjust.checks import seeded
 from gpadjust.validation.comparison import relevance_of
 from paper.common.experiment import Run, Table
 from paper.common.learners import LEARNERS
-from paper.common.tables import Cell, frame, groups, number, of, table
+from paper.common.tables import Cell, frame, groups, markdown, of
+from paper.functions.problems import Problem
 from paper.misled import Misled
 
 METHODS = Misled.axes["method"]
@@ -31,22 +31,6 @@ _FOUND = 1.0  # per cent: where the optimum counts as found
 _LOST = 5.0  # per cent
 
 _GRID = 2**16  # points at which the range is looked for
-
-
-class Problem(NamedTuple):
-    """A function to be maximised in the unit cube, and its physics.
-
-    Attributes:
-        num_inputs: Number ``d`` of inputs.
-        noise: Standard deviation of observations.
-        truth: Maps ``n x d`` to ``n``.
-        physics: The same.
-    """
-
-    num_inputs: int
-    noise: float
-    truth: Callable[[Tensor], Tensor]
-    physics: Callable[[Tensor], Tensor]
 
 
 def _peak(X: Tensor, middle: list[float], widths: list[float], height: float) -> Tensor:
@@ -67,42 +51,43 @@ def _column(X: Tensor, shift: float, curvature: float) -> Tensor:
     return 20 - (curvature * (X - best).square() * X.new_tensor([40.0, 25.0, 30.0])).sum(-1)
 
 
+# Functions and their physics map rows to n values.
 PROBLEMS = {
     "moved peak": Problem(
         2,
-        0.3,
         lambda X: _peak(X, [0.3, 0.7], [0.13, 0.15], 60) + 5 * X[:, 1],
         lambda X: _peak(X, [0.75, 0.3], [0.2, 0.2], 55) + 4 * X[:, 0],
+        0.3,
     ),
     "moved ridge": Problem(
         2,
-        0.2,
         lambda X: 30 * (-((X[:, 0] + X[:, 1] - 1.4) / 0.25).square()).exp() + 6 * X[:, 0],
         lambda X: 30 * (-((X[:, 0] - X[:, 1] + 0.3) / 0.3).square()).exp(),
+        0.2,
     ),
     "unrelated": Problem(
         2,
-        0.1,
         lambda X: 8 * (4 * X[:, 0] + 1).sin() * (3 * X[:, 1]).cos() + 6 * X[:, 0] * X[:, 1],
         lambda X: 9 * (8 * X[:, 0] * X[:, 1] + 2).cos() - 3 * X[:, 1],
+        0.1,
     ),
     "reactor": Problem(
         2,
-        0.5,
         lambda X: _reactor(X, 0.9, 0.25, 12.0) - 3 * (math.pi * X[:, 0]).sin(),
         lambda X: _reactor(X, 1.1, 0.2, 10.0),
+        0.5,
     ),
     "column": Problem(
         3,
-        0.1,
         lambda X: _column(X, 0.0, 1.0) + 1.5 * (5 * X[:, 0] + 2 * X[:, 2]).sin(),
         lambda X: _column(X, 0.08, 0.8),
+        0.1,
     ),
     "mixture": Problem(
         4,
-        0.2,
         lambda X: _peak(X, [0.7, 0.3, 0.5, 0.6], [0.35, 0.3, 0.4, 0.35], 40) + 4 * X[:, 3],
         lambda X: _peak(X, [0.64, 0.36, 0.55, 0.55], [0.4, 0.35, 0.4, 0.4], 33),
+        0.2,
     ),
 }
 
@@ -136,7 +121,7 @@ def run(experiment: Misled, problem: str, method: str, seed: int) -> Run:
         X, Y = torch.cat([X, chosen]), torch.cat([Y, observed(chosen)])
         regrets.append(100 * float(best - given.truth(X).max()) / size)
         relevance.append(weight)
-    return {"regrets": regrets, "relevance": relevance}
+    return {"regrets": regrets} | ({"relevance": relevance} if None not in relevance else {})
 
 
 def _range(problem: Problem) -> tuple[float, float]:
@@ -161,42 +146,33 @@ def _fitted(method: str, X: Tensor, Y: Tensor, problem: Problem) -> tuple[Model,
         plain = SingleTaskGP(X, Y, outcome_transform=Standardize(1))
         fit_gpytorch_mll(ExactMarginalLogLikelihood(plain.likelihood, plain))
         return plain, None
-
-    def physics(X: Tensor) -> Tensor:
-        return problem.physics(X).unsqueeze(-1)
-
     name = {"zero": "gp", "physics-mean": "phymean"}.get(method, method)
-    model: Any = LEARNERS[name].make(X, Y, physics=physics)
-    relevance = relevance_of(model, fit(model))
-    return model, relevance[0] if relevance else None
+    made = LEARNERS[name].make(X, Y, physics=lambda X: problem.physics(X).unsqueeze(-1))
+    relevance = relevance_of(made, fit(made))
+    return made, relevance[0] if relevance else None
 
 
 def tables(runs: Sequence[Run], experiment: Misled) -> dict[str, Table]:
     """All tables, by name."""
     found = frame(runs)
     found["last"] = [regrets[-1] for regrets in found["regrets"]]
-    found["found"] = [_found(regrets) for regrets in found["regrets"]]
-    found["use"] = [weights[-1] for weights in found["relevance"]]
+    # A search without a trial below 1 % finds the optimum never.
+    found["found"] = [
+        next((i + 1.0 for i, each in enumerate(regrets) if each < _FOUND), math.inf)
+        for regrets in found["regrets"]
+    ]
+    found["use"] = [run.get("relevance", [None])[-1] for run in runs]
     columns: dict[str, Cell] = {
         "runs": len,
         "median regret, %": of("last", "median", ".2g"),
         "worst, %": of("last", "max", ".2g"),
         "above 5 %": lambda own: (own["last"] > _LOST).sum(),
-        "trials to 1 %": lambda own: _trials(own["found"].median()),
-        "use": lambda own: number(own["use"].dropna().astype(float).median(), ".2g"),
+        "trials to 1 %": lambda own: of("found", "median", "g")(own).replace("inf", "never"),
+        "use": of("use", "median", ".2g"),
     }
-    lines: list[str] = []
-    for name, part in groups(found, "problem", Misled.axes["problem"]).items():
-        header, rule, *rows = table(groups(part, "method", METHODS), columns).splitlines()
-        rows = [f"| {'' if i else name} {row}" for i, row in enumerate(rows)]
-        lines += rows if lines else [f"|  {header}", f"| --- {rule}", *rows]
-    return {"regrets": Table("Regret after all trials", "\n".join(lines))}
-
-
-def _found(regrets: Sequence[float]) -> float:
-    """The number of the first trial below 1 %; of a search without one, infinite."""
-    return next((i + 1.0 for i, each in enumerate(regrets) if each < _FOUND), float("inf"))
-
-
-def _trials(number: float) -> str:
-    return "never" if number == float("inf") else f"{number:g}"
+    rows: list[list[str]] = []
+    for problem, part in groups(found, "problem", Misled.axes["problem"]).items():
+        for method, own in groups(part, "method", METHODS).items():
+            label = "" if problem in (row[0] for row in rows) else problem
+            rows.append([label, method, *(str(cell(own)) for cell in columns.values())])
+    return {"regrets": Table("Regret after all trials", markdown(["", "", *columns], rows))}

@@ -16,8 +16,7 @@ TEXTBOOK = ("right", "smooth", "confounded", "ball")
 class Parameters(Experiment):
     """Intervals of the parameters of laws, with a discrepancy and without."""
 
-    runs: int = 40
-    """cases of each problem"""
+    runs: int = 40  # cases of each problem
 
     axes: ClassVar[Axes] = {
         "problem": {
@@ -51,10 +50,8 @@ class Parameters(Experiment):
 class Nuts(Experiment):
     """The default fit beside NUTS and the most likely numbers, of the same density."""
 
-    runs: int = 2
-    """seeds of each fit"""
-    num_draws: int = 640
-    """of NUTS, in four chains, after half as many that are not kept"""
+    runs: int = 2  # seeds of each fit
+    num_draws: int = 640  # of NUTS, in four chains, after half as many that are not kept
 
     axes: ClassVar[Axes] = {
         "problem": {

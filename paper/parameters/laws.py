@@ -27,42 +27,25 @@ Law = Callable[[Tensor, ParameterValues], Tensor]
 
 @dataclass(frozen=True)
 class Problem:
-    """A law with unknown parameters, and what is observed of it.
+    """A law with unknown parameters, and what is observed of it."""
 
-    Attributes:
-        law: The physics, of one output.
-        unknowns: Its parameters.
-        box: Least and largest inputs, ``d`` each.
-        number: Of observations.
-        noise: Its standard deviation.
-    """
-
-    law: Law
-    unknowns: Mapping[str, Unknown]
-    box: tuple[tuple[float, ...], tuple[float, ...]]
-    number: int
-    noise: float
+    law: Law  # the physics, of one output
+    unknowns: Mapping[str, Unknown]  # its parameters
+    box: tuple[tuple[float, ...], tuple[float, ...]]  # least and largest inputs, `d` each
+    number: int  # of observations
+    noise: float  # its standard deviation
 
 
 @dataclass(frozen=True)
 class Case:
-    """Observations of a system, and a law of it.
+    """Observations of a system, and a law of it."""
 
-    Attributes:
-        X: Inputs, ``n x d``.
-        system: The system there without noise, ``n x 1``; it need not be the law's.
-        Y: Observations, ``n x 1``.
-        physics: The law.
-        true: The parameters that the system has, in so far as it has any.
-        noise: The standard deviation of the noise.
-    """
-
-    X: Tensor
-    system: Tensor
-    Y: Tensor
-    physics: FunctionPhysics
-    true: Mapping[str, float]
-    noise: float
+    X: Tensor  # inputs, `n x d`
+    system: Tensor  # the system there without noise, `n x 1`; it need not be the law's
+    Y: Tensor  # observations, `n x 1`
+    physics: FunctionPhysics  # the law
+    true: Mapping[str, float]  # the parameters that the system has, in so far as it has any
+    noise: float  # the standard deviation of the noise
 
     @property
     def best(self) -> dict[str, float]:
@@ -138,74 +121,40 @@ def _alias(X: Tensor, p: ParameterValues) -> Tensor:
     return p.size * (p.rate * X[:, 0]).cos()
 
 
-def _spectral(factor: float) -> dict[str, Unknown]:
-    middles = {f"c{i}": Unknown(c, sd=0.04) for i, c in ((1, 0.25), (2, 0.5), (3, 0.75))}
-    heights = {f"a{i}": Unknown(1.0, factor=factor) for i in (1, 2, 3)}
-    return {**heights, **middles, **{f"w{i}": Unknown(0.1, factor=1.3) for i in (1, 2, 3)}}
+_PEAKS = {
+    **{f"a{i}": Unknown(1.0, factor=1.5) for i in (1, 2, 3)},
+    **{f"c{i}": Unknown(i / 4, sd=0.04) for i in (1, 2, 3)},
+    **{f"w{i}": Unknown(0.1, factor=1.3) for i in (1, 2, 3)},
+}
 
 
+def _box(low: float, high: float) -> tuple[tuple[float], tuple[float]]:
+    return (low,), (high,)
+
+
+_ENZYME = {
+    "V": Unknown(3.0, factor=1.6),
+    "K": Unknown(2.0, factor=1.6),
+    "Ki": Unknown(1.0, factor=2.0),
+}
+_BEAM = {"EI": Unknown(10.0, factor=1.5), "kr": Unknown(30.0, factor=1.5)}
+_ARRHENIUS = {"logA": Unknown(22.0, sd=2.0), "E": Unknown(63.0, sd=6.0)}
+_DASHPOT = {"E": Unknown(2.0, factor=1.8), "eta": Unknown(2.0, factor=1.6)}
+_SWING = {"swing": Unknown(0.3, sd=1.0), "phase": Unknown(0.2, bounds=(-math.pi, math.pi))}
+_LENS = {"focus": Unknown(1.3, sd=1.0), "rest": Unknown(0.0, sd=1.0)}
+_SIZE = Unknown(1.0, sd=0.3)
+_RADAR = {"size": _SIZE, "rate": Unknown(20.0, sd=12.0)}
+_OSCILLATOR = {"size": _SIZE, "rate": Unknown(6.0, sd=4.0)}
 PROBLEMS = {
-    "beam": Problem(
-        _beam,
-        {"EI": Unknown(10.0, factor=1.5), "kr": Unknown(30.0, factor=1.5)},
-        ((0.2, 0.8), (1.0, 1.0)),
-        14,
-        0.01,
-    ),
-    "reaction": Problem(
-        _reaction,
-        {"logA": Unknown(22.0, sd=2.0), "E": Unknown(63.0, sd=6.0)},
-        ((325.0,), (345.0,)),
-        12,
-        0.01,
-    ),
-    "creep": Problem(
-        _creep,
-        {"E": Unknown(2.0, factor=1.8), "eta": Unknown(2.0, factor=1.6)},
-        ((0.05,), (1.0,)),
-        13,
-        0.01,
-    ),
-    "inhibitor": Problem(
-        _inhibited,
-        {
-            "V": Unknown(3.0, factor=1.6),
-            "K": Unknown(2.0, factor=1.6),
-            "Ki": Unknown(1.0, factor=2.0),
-        },
-        ((0.1, 0.0), (1.5, 1.0)),
-        14,
-        0.02,
-    ),
-    "spectrum": Problem(_spectrum, _spectral(1.5), ((0.0,), (1.0,)), 40, 0.05),
-    "pendulum": Problem(
-        _pendulum,
-        {"swing": Unknown(0.3, sd=1.0), "phase": Unknown(0.2, bounds=(-math.pi, math.pi))},
-        ((0.0,), (2.0,)),
-        12,
-        0.1,
-    ),
-    "focus": Problem(
-        _square,
-        {"focus": Unknown(1.3, sd=1.0), "rest": Unknown(0.0, sd=1.0)},
-        ((0.0,), (2.0,)),
-        12,
-        0.1,
-    ),
-    "radar": Problem(
-        _alias,
-        {"size": Unknown(1.0, sd=0.3), "rate": Unknown(20.0, sd=12.0)},
-        ((0.0,), (3.0,)),
-        12,
-        0.4,
-    ),
-    "alias": Problem(
-        _alias,
-        {"size": Unknown(1.0, sd=0.3), "rate": Unknown(6.0, sd=4.0)},
-        ((0.0,), (3.0,)),
-        12,
-        0.2,
-    ),
+    "beam": Problem(_beam, _BEAM, ((0.2, 0.8), (1.0, 1.0)), 14, 0.01),
+    "reaction": Problem(_reaction, _ARRHENIUS, _box(325.0, 345.0), 12, 0.01),
+    "creep": Problem(_creep, _DASHPOT, _box(0.05, 1.0), 13, 0.01),
+    "inhibitor": Problem(_inhibited, _ENZYME, ((0.1, 0.0), (1.5, 1.0)), 14, 0.02),
+    "spectrum": Problem(_spectrum, _PEAKS, _box(0.0, 1.0), 40, 0.05),
+    "pendulum": Problem(_pendulum, _SWING, _box(0.0, 2.0), 12, 0.1),
+    "focus": Problem(_square, _LENS, _box(0.0, 2.0), 12, 0.1),
+    "radar": Problem(_alias, _RADAR, _box(0.0, 3.0), 12, 0.4),
+    "alias": Problem(_alias, _OSCILLATOR, _box(0.0, 3.0), 12, 0.2),
 }
 
 

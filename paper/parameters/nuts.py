@@ -6,8 +6,7 @@ Models of nested ones are compared without these: NUTS draws from the density of
 from __future__ import annotations
 
 import time
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,8 @@ from gpadjust.core import GP
 from gpadjust.core.summary import numbers_of
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
-from paper.common.tables import markdown
+from paper.common.tables import markdown, number
+from paper.functions.problems import PROBLEMS
 from paper.parameters import Nuts
 from paper.parameters.laws import case, textbook_case
 from paper.published.nist import model_of
@@ -46,8 +46,8 @@ def model_for(problem: str) -> GP:
         return CKA(X, Y, physics=lambda X: (2 * X).sin(), nested=False)
     if problem == "forrester":
         X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-        Y = (6 * X - 2).square() * (12 * X - 4).sin()
-        return CKA(X, Y, physics=_low_forrester, nested=False)
+        Y = PROBLEMS["forrester"].truth(X)
+        return CKA(X, Y, physics=PROBLEMS["forrester"].physics, nested=False)
     if problem == "Thurber":
         return model_of(problem, 2)
     known = textbook_case("ball", 0) if problem == "ball" else case("inhibitor", 0)
@@ -55,15 +55,9 @@ def model_for(problem: str) -> GP:
     return structure(known.X, known.Y, physics=known.physics)
 
 
-def _low_forrester(X: torch.Tensor) -> torch.Tensor:
-    return 0.5 * (6 * X - 2).square() * (12 * X - 4).sin() + 10 * (X - 0.5) - 5
-
-
 def run(experiment: Nuts, problem: str, method: str, seed: int) -> Run:
     """Fit a model; return quantiles of all numbers, and bands along the first input."""
-    warnings.simplefilter("ignore")
-    model = model_for(problem)
-    begin = time.perf_counter()
+    model, begin = model_for(problem), time.perf_counter()
     draws = experiment.num_draws if method == "nuts" else None
     result = fit(model, method, num_draws=draws, seed=seed)
     seconds = time.perf_counter() - begin
@@ -90,32 +84,28 @@ def run(experiment: Nuts, problem: str, method: str, seed: int) -> Run:
 
 def tables(runs: Sequence[Run], experiment: Nuts) -> dict[str, Table]:
     """All tables, by name."""
-    header = ["", "fit", "medians, off by", "widths of intervals", "means, off by"]
-    header += ["widths of bands", "R-hat", "seconds"]
     rows = []
     for problem, label in experiment.axes["problem"].items():
         own = [run for run in runs if run["problem"] == problem]
         for method, text in experiment.axes["method"].items():
-            found = _beside(own, method) if own else {}
-            if found:
-                rows.append([label if method == "bayes" else "", text, *found.values()])
-    return {
-        "summary": Table(
-            "Beside NUTS, in its standard deviations and widths", markdown(header, rows)
-        )
-    }
+            cells = _beside(own, method)
+            if cells:
+                rows.append([label if method == "bayes" else "", text, *cells])
+    header = ["", "fit", "medians, off by", "widths of intervals", "means, off by"]
+    text = markdown([*header, "widths of bands", "R-hat", "seconds"], rows)
+    return {"summary": Table("Beside NUTS, in its standard deviations and widths", text)}
 
 
-def _beside(runs: Sequence[Run], method: str) -> Mapping[str, str]:
+def _beside(runs: Sequence[Run], method: str) -> list[str]:
     """Return the cells of a method; of NUTS those of its second seed beside its first."""
-    by = {(run["method"], run["seed"]): run for run in runs}
-    first = min(seed for _, seed in by)
-    reference = by.get(("nuts", first))
-    own = [run for (name, seed), run in by.items() if name == method]
+    by_nuts = [run for run in runs if run["method"] == "nuts"]
+    reference = min(by_nuts, key=lambda run: run["seed"], default={})
+    own = [run for run in runs if run["method"] == method]
     others = [run for run in own if run is not reference]
-    if reference is None or not others:
-        return {}
+    if not reference or not others:
+        return []
     off, wide, mean_off, band = [], [], [], []
+    low, high = np.array(reference["lower"]), np.array(reference["upper"])
     for run in others:
         for name, values in reference["numbers"].items():
             ours, theirs = np.array(run["numbers"][name]), np.array(values)
@@ -123,19 +113,18 @@ def _beside(runs: Sequence[Run], method: str) -> Mapping[str, str]:
                 ours, theirs = np.log(ours), np.log(theirs)
             off.append(abs(np.median(ours) - np.median(theirs)) / max(theirs.std(), 1e-12))
             wide.append((ours[-2] - ours[1]) / max(theirs[-2] - theirs[1], 1e-12))
-        low, high = np.array(reference["lower"]), np.array(reference["upper"])
         gap = (np.array(run["mean"]) - reference["mean"]) / (high - low) * 2 * 1.96
         mean_off.append(np.sqrt(np.mean(gap**2)))
         band.append(np.mean((np.array(run["upper"]) - run["lower"]) / (high - low)))
-    rhat = max((run["rhat"] for run in own if run["rhat"] is not None), default=float("nan"))
-    return {
-        "off": f"{max(off):.2f}",
-        "wide": f"{min(wide):.2f} to {max(wide):.2f}" if max(wide) else "0",
-        "mean": f"{np.mean(mean_off):.2f}",
-        "band": f"{np.mean(band):.2f}",
-        "rhat": "" if np.isnan(rhat) else f"{rhat:.2f}",
-        "seconds": f"{np.mean([run['seconds'] for run in own]):.1f}",
-    }
+    rhats = [run["rhat"] for run in own if run["rhat"] is not None]
+    return [
+        f"{max(off):.2f}",
+        f"{min(wide):.2f} to {max(wide):.2f}" if max(wide) else "0",
+        f"{np.mean(mean_off):.2f}",
+        f"{np.mean(band):.2f}",
+        number(max(rhats, default=None), ".2f"),
+        f"{np.mean([run['seconds'] for run in own]):.1f}",
+    ]
 
 
 def draw(runs: Sequence[Run], experiment: Nuts) -> list[Path]:

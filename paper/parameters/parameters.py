@@ -2,51 +2,35 @@
 
 from __future__ import annotations
 
-import time
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import pandas as pd
 import torch
 
-from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, fit
-from gpadjust.core import GP, SamplingWarning
-from gpadjust.validation import Scores
-from paper.common.experiment import Run, Table
-from paper.common.tables import Cell, groups, number, of, table
+from paper.common.experiment import Run, Table, fitted
+from paper.common.learners import LEARNERS
+from paper.common.tables import Cell, groups, of, part_of, table
+from paper.common.verdicts import scores_of
 from paper.parameters import TEXTBOOK, Parameters
 from paper.parameters.laws import case, textbook_case
-
-MODELS: Mapping[str, Callable[..., GP]] = {
-    "physics": CalibratedPhysics,
-    "free": PhysicsMeanGP,
-    "cka": CKA,
-}
 
 
 def run(experiment: Parameters, problem: str, model: str, seed: int) -> Run:
     """Fit a model to a case; return ends of intervals, beside what they are to hold."""
-    warnings.simplefilter("ignore", SamplingWarning)
     known = textbook_case(problem, seed) if problem in TEXTBOOK else case(problem, seed)
-    fitted: Any = MODELS[model](known.X, known.Y, physics=known.physics)
-    begin = time.perf_counter()
-    fit(fitted)
-    seconds = time.perf_counter() - begin
-    low, high = (end.tolist() for end in fitted.physics_parameters.interval())
-    best = known.best if problem in TEXTBOOK else dict(known.true)
-    with torch.no_grad():
-        mean, variance = fitted.predict(known.X)
-        lower, upper = fitted.interval(known.X)
-    inside = (lower <= known.system) & (known.system <= upper)
-    return {
-        "intervals": {name: [low[i], high[i]] for i, name in enumerate(best)},
-        "best": best,
+    made = LEARNERS[model].make(known.X, known.Y, physics=known.physics)
+    seconds = fitted(made)
+    names, ends = [*known.physics.unknowns], torch.stack(made.physics_parameters.interval(), -1)
+    low, high = made.interval(known.X)
+    scores = scores_of(made.predict(known.X).mean, low, high, known.system)
+    results = {
+        "intervals": dict(zip(names, ends.tolist(), strict=True)),
         "true": dict(known.true),
-        "rmse": Scores.compute(mean, variance, known.system).rmse.item(),
-        "coverage": inside.double().mean().item(),
+        "rmse": scores["rmse"],
+        "coverage": scores["coverage"],
         "seconds": seconds,
     }
+    return results | ({"best": known.best} if problem in TEXTBOOK else {})
 
 
 def tables(runs: Sequence[Run], experiment: Parameters) -> dict[str, Table]:
@@ -55,7 +39,7 @@ def tables(runs: Sequence[Run], experiment: Parameters) -> dict[str, Table]:
     columns: dict[str, Cell] = {
         "cases": len,
         "holds the best": of("best", "mean", ".2f"),
-        "holds the true": lambda own: number(own["true"].astype(float).mean(), ".2f"),
+        "holds the true": of("true", "mean", ".2f"),
         "median width": of("width", "median"),
         "RMSE": of("rmse", "median"),
         "coverage": of("coverage", "mean", ".2f"),
@@ -63,7 +47,7 @@ def tables(runs: Sequence[Run], experiment: Parameters) -> dict[str, Table]:
     }
     tables = {}
     for problem in TEXTBOOK:
-        own = found[found["problem"] == problem]
+        own = part_of(found, problem=problem)
         rows = groups(own, ["model", "parameter"], lambda m, p: f"{axes['model'][m]}, {p}")
         text = table(rows, columns, "model, parameter")
         tables[problem] = Table(axes["problem"][problem], text)
@@ -76,9 +60,11 @@ def load(runs: Sequence[Run]) -> pd.DataFrame:
     """A row for each parameter of each case and model."""
     rows = []
     for run in runs:
+        shared = {key: run[key] for key in ("problem", "model", "rmse", "coverage", "seconds")}
         for name, (low, high) in run["intervals"].items():
-            row = {key: run[key] for key in ("problem", "model", "rmse", "coverage", "seconds")}
-            best, true = run["best"][name], run["true"].get(name)
-            row |= {"parameter": name, "width": high - low, "best": float(low <= best <= high)}
-            rows.append({**row, "true": None if true is None else float(low <= true <= high)})
+            row = {**shared, "parameter": name, "width": high - low}
+            for what in ("true", "best"):
+                values: dict[str, float] = run[what if what in run else "true"]
+                row[what] = float(low <= values[name] <= high) if name in values else None
+            rows.append(row)
     return pd.DataFrame(rows)

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 from paper.common.experiment import Axes, Experiment
 from paper.common.learners import labels
 
 TABLES = ("yacht", "energy", "concrete")
-OURS = {"formula": "formula, parameters fitted"} | labels("phymean", "cka", "gp")
-RIVALS = {
-    "single": "BoTorch's SingleTaskGP",
-    "feature": "SingleTaskGP, formula as an input",
-    "boosting": "boosted trees, formula as an input",
-    "ensemble": "formula and a deep ensemble",
-    "mfk": "SMT's MFK",
-}
+OURS = labels("formula", "phymean", "cka", "gp")
+BOOSTING = "boosted trees, formula as an input"
+
+
+def published(experiment: str) -> dict[str, list[str]]:
+    """Published numbers that stand below those of an experiment, by the method."""
+    with open(Path(__file__).parent / "data" / "published.csv", newline="") as file:
+        return {row[1]: row[2:] for row in csv.reader(file) if row[0] == experiment}
+
+
 _CALLS = (
     *("gpadjust.fit", "gpadjust.CKA", "gpadjust.PhysicsMeanGP", "gpadjust.ZeroMeanGP"),
     "gpadjust.CalibratedPhysics",
@@ -25,23 +29,40 @@ _CALLS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Uci(Experiment):
-    """Yacht, energy and concrete on their usual splits, with a formula each, and rivals."""
+class Splits(Experiment):
+    """An experiment whose seeds are the numbers of splits that others made."""
 
-    axes: ClassVar[Axes] = {
-        "table": {name: name for name in TABLES},
-        "share": {0.1: "10 %", 0.9: "90 %"},
-        "method": {**OURS, **RIVALS},
-    }
+    splits: ClassVar[int]
     calls: ClassVar[tuple[str, ...]] = _CALLS
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "scikit-learn", "smt")
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "scikit-learn")
 
     def check(self) -> None:
         """Raise a ValueError for a split that there is not."""
-        if not 0 <= self.seed <= 20 - self.runs:
+        if not 0 <= self.seed <= self.splits - self.runs:
             raise ValueError(
-                f"There are twenty splits, 0 to 19; found --seed {self.seed} --runs {self.runs}."
+                f"There are {self.splits} splits, 0 to {self.splits - 1}; found --seed {self.seed} "
+                f"--runs {self.runs}."
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uci(Splits):
+    """Yacht, energy and concrete on their usual splits, with a formula each, and rivals."""
+
+    splits: ClassVar[int] = 20
+    axes: ClassVar[Axes] = {
+        "table": {name: name for name in TABLES},
+        "share": {0.1: "10 %", 0.9: "90 %"},
+        "method": OURS
+        | {
+            "single": "BoTorch's SingleTaskGP",
+            "feature": "SingleTaskGP, formula as an input",
+            "boosting": BOOSTING,
+            "ensemble": "formula and a deep ensemble",
+            "mfk": "SMT's MFK",
+        },
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Splits.packages, "smt")
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """All splits, three of the large tables by nine tenths; of what is slow, few rows alone."""
@@ -54,26 +75,13 @@ class Uci(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steels(Experiment):
+class Steels(Splits):
     """Yield strengths of 312 steels by ten lines of metallurgy, in the five folds of Matbench."""
 
-    runs: int = 5
-    """folds; there are five"""
+    runs: int = 5  # folds; there are five
 
-    axes: ClassVar[Axes] = {
-        "method": {"formula": "formula, parameters fitted"}
-        | labels("phymean", "cka", "gp")
-        | {"boosting": "boosted trees, formula as an input"},
-    }
-    calls: ClassVar[tuple[str, ...]] = _CALLS
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "scikit-learn")
-
-    def check(self) -> None:
-        """Raise a ValueError for a fold that there is not."""
-        if not 0 <= self.seed <= 5 - self.runs:
-            raise ValueError(
-                f"There are five folds, 0 to 4; found --seed {self.seed} --runs {self.runs}."
-            )
+    splits: ClassVar[int] = 5
+    axes: ClassVar[Axes] = {"method": OURS | {"boosting": BOOSTING}}
 
 
 NIST_SETS = (
@@ -89,8 +97,7 @@ NIST_SETS = (
 class Nist(Experiment):
     """NIST's certified nonlinear regressions: values and intervals from both starts."""
 
-    runs: int = 2
-    """seeds of each set and start"""
+    runs: int = 2  # seeds of each set and start
 
     axes: ClassVar[Axes] = {
         "name": {name: name for name in NIST_SETS},
@@ -109,18 +116,12 @@ _DYNAMICS = (
 class Emps(Experiment):
     """A servo with dry friction: the record with force pulses, simulated by what another taught."""
 
-    runs: int = 5
-    """draws of the smoothed states; what does not learn from these has one run"""
-    seed: int = 10
-    """the first seed; 0 and 1 were for trying"""
-    rows: int = 4968
-    """of each record, the first ones"""
-    every: int = 5
-    """rows of 5 ms in a step"""
-    rounds: int = 100
-    """of smoothing, at most"""
-    num_functions: int = 39
-    """particles of a free run"""
+    runs: int = 5  # draws of the smoothed states; what does not learn from these has one run
+    seed: int = 10  # the first seed; 0 and 1 were for trying
+    rows: int = 4968  # of each record, the first ones
+    every: int = 5  # rows of 5 ms in a step
+    rounds: int = 100  # of smoothing, at most
+    num_functions: int = 39  # particles of a free run
 
     axes: ClassVar[Axes] = {
         "learner": {
@@ -132,28 +133,19 @@ class Emps(Experiment):
         }
     }
     calls: ClassVar[tuple[str, ...]] = _DYNAMICS
-
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """One run of what does not learn from draws."""
-        return self.seeds[:1] if kind[0] in ("authors", "fitted") else self.seeds
+    single: ClassVar[tuple[str, ...]] = ("authors", "fitted")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Freeruns(Experiment):
     """The first part of a record teaches, and a free run follows the rest."""
 
-    runs: int = 3
-    """draws of what is learnt from; f_p alone has one run"""
-    seed: int = 10
-    """the first seed; 0 was for trying"""
-    transitions: int = 300
-    """that GPs learn from, spread evenly, or as many as there are"""
-    rounds: int = 100
-    """of smoothing, at most"""
-    starts: int = 2
-    """of smoothing"""
-    num_functions: int = 39
-    """particles of a free run"""
+    runs: int = 3  # draws of what is learnt from; f_p alone has one run
+    seed: int = 10  # the first seed; 0 was for trying
+    transitions: int = 300  # that GPs learn from, spread evenly, or as many as there are
+    rounds: int = 100  # of smoothing, at most
+    starts: int = 2  # of smoothing
+    num_functions: int = 39  # particles of a free run
 
     axes: ClassVar[Axes] = {
         "record": {
@@ -170,24 +162,17 @@ class Freeruns(Experiment):
         },
     }
     calls: ClassVar[tuple[str, ...]] = _DYNAMICS
-
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """One run of f_p alone."""
-        return self.seeds[:1] if kind[1] == "fitted" else self.seeds
+    single: ClassVar[tuple[str, ...]] = ("fitted",)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Masses(Experiment):
     """Binding energies of nuclides: a liquid drop and what it lacks."""
 
-    runs: int = 3
-    """folds of ten that are left out"""
-    split: int = 0
-    """seed of the ten folds"""
-    num_rows: int = 600
-    """random rows for the search for hyper-parameters, and for f_p alone"""
-    stride: int = 1
-    """every how many-th element is taken"""
+    runs: int = 3  # folds of ten that are left out
+    split: int = 0  # seed of the ten folds
+    num_rows: int = 600  # random rows for the search for hyper-parameters, and for f_p alone
+    stride: int = 1  # every how many-th element is taken
 
     axes: ClassVar[Axes] = {
         "task": {"fold": "folds of ten", "outer2": "outermost 2", "outer4": "outermost 4"},

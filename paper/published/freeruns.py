@@ -11,9 +11,7 @@ in an earlier experiment (``earlier.md``), which has the candidates.
 
 from __future__ import annotations
 
-import math
 import time
-import warnings
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -24,29 +22,17 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
-from gpadjust.core import SamplingWarning
 from gpadjust.dynamics import FreeRun, LearnedDynamics, PhysicsDynamics
-from gpadjust.records import SmoothedRecords, SmoothingWarning, smooth
+from gpadjust.records import SmoothedRecords, smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
-from paper.common.tables import across, frame, groups, number, of, table, with_rows
-from paper.common.verdicts import Difference
-from paper.published import Freeruns
+from paper.common.free_runs import ends_of, path_of
+from paper.common.learners import LEARNERS
+from paper.common.tables import across, frame, groups, mean_error, number, of, table
+from paper.common.verdicts import scores_of
+from paper.published import Freeruns, published
 from paper.published.freeruns_systems import SYSTEMS, narx_spec, records
 
-PUBLISHED = {
-    "DKF": (0.144, 5.589, 0.735),
-    "vGPSSM": (0.268, 3.676, 0.740),
-    "CO-GPSSM": (0.079, 1.898, 0.736),
-    "ODGPSSM": (0.068, 1.704, 0.708),
-    "VCDT": (0.065, 2.052, 0.735),
-    "AD-EnKF": (0.057, 1.408, 0.756),
-    "PR-SSM": (0.074, 1.503, 0.647),
-    "EnVI": (0.055, 1.388, 0.703),
-}
-"""Errors of ball and beam, furnace and drive in table II of Lin et al. 2024 (arXiv 2312.05910)."""
-_MODELS = {"delta": PhysicsMeanGP, "cka": CKA, "gp": ZeroMeanGP}
 _ROWS = 125  # of a path that is kept
 
 
@@ -58,50 +44,34 @@ def smoothed(record: str, experiment: Freeruns) -> SmoothedRecords:
         whole = (*system.noise, *[1.0] * system.delay)  # earlier actions have none
         given["process_noise"] = torch.tensor(whole, dtype=torch.float64)
     output, rows = system.column(system.output), slice(0, system.train)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SmoothingWarning)
-        return smooth(
-            records(output[rows, None], system.column(system.action)[rows], system.spec()),
-            system.physics(),
-            start=system.start,
-            num_starts=experiment.starts,
-            max_rounds=experiment.rounds,
-            **given,
-        )
+    return smooth(
+        records(output[rows, None], system.column(system.action)[rows], system.spec()),
+        system.physics(),
+        start=system.start,
+        num_starts=experiment.starts,
+        max_rounds=experiment.rounds,
+        **given,
+    )
 
 
 def run(experiment: Freeruns, record: str, learner: str, seed: int) -> Run:
     """Learn from the first part of a record, and follow the rest."""
-    warnings.simplefilter("ignore", SamplingWarning)
     begin, system = time.perf_counter(), SYSTEMS[record]
     free = _followed(experiment, record, learner, seed)
     output = system.column(system.output)[system.train :]
-    mean, low, high = (each[0, :, 0] for each in (free.mean, free.lower, free.upper))
+    mean, low, high = ends_of(free)
     if learner == "fitted":
-        mean = _path(experiment, record)
-    every = -(-len(output) // _ROWS)
-    kept = {"mean": mean, "low": low, "high": high}
-    return {
-        "rmse": float((mean - output).square().mean().sqrt()),
-        "coverage": float(((low <= output) & (output <= high)).double().mean()),
-        "half_width": float((high - low).mean() / 2),
-        "path": {
-            name: [round(x, 5) for x in part[::every].tolist()] for name, part in kept.items()
-        },
-        "seconds": time.perf_counter() - begin,
-    }
-
-
-def _path(experiment: Freeruns, record: str) -> Tensor:
-    """The output by f_p alone, without noise."""
-    system, known = SYSTEMS[record], smoothed(record, experiment)
-    f_p = system.physics(known.physics_parameters.mean.tolist())
-    step = PhysicsDynamics(system.spec(), f_p).mean_function()
-    state, outputs = _last(record, known, 0), []
-    for action in system.column(system.action)[system.train - 1 : -1]:
-        state = step(state[None], action.view(1, 1, 1))[0]
-        outputs.append(state[0, 0])
-    return torch.stack(outputs)
+        known = smoothed(record, experiment)
+        f_p = system.physics(known.physics_parameters.mean.tolist())
+        actions = system.column(system.action)[system.train - 1 : -1]
+        mean = path_of(system.spec(), f_p, _last(record, known, 0), actions)[:, 0]
+    results: Run = scores_of(mean, low, high, output)
+    if learner == "cka" and seed == experiment.seed:
+        path, every = {"mean": mean, "low": low, "high": high}, -(-len(output) // _ROWS)
+        results["path"] = {
+            name: part[::every].round(decimals=5).tolist() for name, part in path.items()
+        }
+    return {**results, "seconds": time.perf_counter() - begin}
 
 
 def _followed(experiment: Freeruns, record: str, learner: str, seed: int) -> FreeRun:
@@ -112,7 +82,7 @@ def _followed(experiment: Freeruns, record: str, learner: str, seed: int) -> Fre
     if learner == "gp":
         outputs, lags = system.narx
         spec, states = narx_spec(outputs, lags), output[:rows, None]
-        dynamics: Any = LearnedDynamics(spec, model=ZeroMeanGP)
+        dynamics: Any = LearnedDynamics(spec, model=LEARNERS["gp"].make)
         columns = [output[rows - 1 - k] for k in range(outputs)]
         columns += [actions[rows - 1 - k] for k in range(1, lags)]
         start, given["start_noise"] = torch.stack(columns)[None], "learnt"
@@ -130,7 +100,7 @@ def _followed(experiment: Freeruns, record: str, learner: str, seed: int) -> Fre
             dynamics, given["process_noise"] = PhysicsDynamics(spec, f_p), known.process_noise
         else:
             states = known.draw(seed).records[0].states[:, :moving]
-            dynamics = LearnedDynamics(spec, f_p, model=_MODELS[learner])
+            dynamics = LearnedDynamics(spec, f_p, model=LEARNERS[learner].make)
             given["process_noise"] = "learnt"
     if learner != "fitted":
         # Smoothing leaves out rows whose action is not known.
@@ -153,20 +123,18 @@ def tables(runs: Sequence[Run], experiment: Freeruns) -> dict[str, Table]:
     """Errors, and what intervals hold, of each learner."""
     found, labels = frame(runs), experiment.axes["record"]
     names = experiment.axes["learner"]
-    parts = groups(found, "learner", names)
 
     def rmse(part: pd.DataFrame) -> str:
-        of_all = Difference.of(part["rmse"].astype(float))
-        several = math.isfinite(of_all.error) and of_all.error > 1e-9
-        return number(of_all.mean, ".3f") + (f" ± {of_all.error:.1g}" if several else "")
+        differ = part["rmse"].std() > 1e-9
+        return (mean_error("rmse", ".3f", ".1g") if differ else of("rmse", "mean", ".3f"))(part)
 
-    text = table(parts, across(found, "record", labels, rmse), "RMSE")
     there = [name for name in labels if (found["record"] == name).any()]
-    more = {"mean of the first part": [_trivial(name) for name in there]}
-    for method, errors in PUBLISHED.items():
+    more = [["mean of the first part", *map(_trivial, there)]]
+    for method, errors in published("freeruns").items():
         known = dict(zip(labels, errors, strict=False))
-        more[f"{method}, published"] = [number(known.get(name, math.nan), ".3f") for name in there]
-    text = with_rows(text, [[label, *cells] for label, cells in more.items()])
+        more.append([f"{method}, published", *(known.get(name, "") for name in there)])
+    columns = across(found, "record", labels, rmse)
+    text = table(groups(found, "learner", names), columns, "RMSE", more)
     shown = {"95 % hold": of("coverage", "mean", ".2f"), "half width of 95 %": of("half_width")}
     shown |= {"seconds": of("seconds", "mean", ".0f"), "runs": len}
     each = groups(found, ["record", "learner"], lambda r, name: f"{labels[r]}, {names[name]}")
@@ -184,14 +152,14 @@ def _trivial(name: str) -> str:
 
 def draw(runs: Sequence[Run], experiment: Freeruns) -> list[Path]:
     """Draw the first free run of CKA of each record."""
-    shown = {run["record"]: run["path"] for run in reversed(runs) if run["learner"] == "cka"}
+    first = [r for r in runs if r["learner"] == "cka" and r["seed"] == experiment.seed]
+    shown = {run["record"]: run["path"] for run in first}
     titles = {name: label for name, label in experiment.axes["record"].items() if name in shown}
     if not titles:
         return []
-    figure, axes = panels(
-        [f"{label}: CKA" for label in titles.values()], 2, (4.4, 2.2), share=False
-    )
-    for ax, name in zip(axes, titles, strict=False):
+    titled = [f"{label}: CKA" for label in titles.values()]
+    figure, axes = panels(titled, 2, (4.4, 2.2), share=False)
+    for ax, name in zip(axes, titles, strict=True):
         system, path = SYSTEMS[name], shown[name]
         measured = system.column(system.output)[system.train :]
         rows = -(-len(measured) // len(path["mean"])) * np.arange(len(path["mean"]))

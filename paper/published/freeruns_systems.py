@@ -14,47 +14,32 @@ from gpadjust import FunctionPhysics, Unknown
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import ParameterValues
 from gpadjust.records import Record, Records
+from paper.common.free_runs import law_of
 
 DATA = Path(__file__).parent / "data" / "records"
 
 
 class System(NamedTuple):
-    """A record, its parts, and a line of physics for it.
+    """A record, its parts, and a line of physics for it."""
 
-    Args:
-        file: Its name.
-        action: Column of the action.
-        output: Column of the output.
-        train: Rows of the first part, as in PR-SSM's code; of the tanks as in RGP's.
-        states: States of f_p, that of the output first; the others are hidden.
-        following: Next states from these and the action, by the parameters.
-        unknowns: These, with priors.
-        start: Of hidden states, mean and standard deviation at first.
-        noise: Process noise; None if it is learnt.
-        delay: Steps by which the action is late.
-        earlier: How many earlier actions a GP beside f_p reads.
-        narx: How many outputs and actions a GP without f_p reads.
-    """
-
-    file: str
-    action: str
-    output: str
-    train: int
-    states: tuple[str, ...]
+    file: str  # its name
+    action: str  # column of the action
+    output: str  # column of the output
+    train: int  # rows of the first part, as in PR-SSM's code; of the tanks as in RGP's
+    states: tuple[str, ...]  # states of f_p, that of the output first; the others are hidden
+    # Next states from these and the action, by the parameters.
     following: Callable[[Tensor, ParameterValues], Tensor]
-    unknowns: Mapping[str, Unknown]
+    unknowns: Mapping[str, Unknown]  # these, with priors
+    # Of hidden states, mean and standard deviation at first.
     start: Mapping[str, tuple[float, float]]
-    noise: tuple[float, ...] | None
-    narx: tuple[int, int]
-    delay: int = 0
-    earlier: int = 0
+    noise: tuple[float, ...] | None  # process noise; None if it is learnt
+    narx: tuple[int, int]  # how many outputs and actions a GP without f_p reads
+    delay: int = 0  # steps by which the action is late
+    earlier: int = 0  # how many earlier actions a GP beside f_p reads
 
     def physics(self, values: list[float] | None = None) -> FunctionPhysics:
         """The next states, with unknown parameters or these."""
-        if values is None:
-            return FunctionPhysics(self.following, unknowns=self.unknowns)
-        known = ParameterValues(tuple(self.unknowns), torch.tensor(values, dtype=torch.float64))
-        return FunctionPhysics(lambda X: self.following(X, known))
+        return law_of(self.following, self.unknowns, values)
 
     def spec(self, earlier: int = 0) -> StateSpec:
         """States and actions, with so many earlier actions, or as many as f_p reads."""

@@ -17,7 +17,7 @@ iterations a fit needs. The ends of chains were looked at in no way.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,22 +26,18 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, Unknown, ZeroMeanGP, fit
-from gpadjust.core import GP, MATERN52, Stationary
+from gpadjust import CalibratedPhysics, Unknown, fit
+from gpadjust.core import MATERN52, Stationary
 from gpadjust.core.kernels import RHO
 from gpadjust.physics import FunctionPhysics, ParameterValues
 from paper.common.experiment import Run, Table
-from paper.common.tables import Cell, frame, groups, number, of, table, with_rows
-from paper.published import Masses
+from paper.common.learners import LEARNERS
+from paper.common.tables import Cell, frame, groups, number, of, part_of, table
+from paper.common.verdicts import scores_of
+from paper.published import Masses, published
 
 DATA = Path(__file__).parent / "data" / "masses" / "ame2020.csv"
 MAGIC = (8, 20, 28, 50, 82, 126, 184)
-PUBLISHED = {
-    "published: drop and deep net, 26 features, ten folds of 2,149": "0.263",
-    "published: the same, Z, N and A alone": "0.332",
-}
-"""RMSE of ten folds in MeV: C.-Q. Li et al., Deep learning on nuclear mass and alpha decay
-half-lives, tenfold cross-validation."""
 _INPUTS = ["Z", "N", "odd Z", "odd N", "near N = Z"]
 
 
@@ -78,7 +74,6 @@ _SHELL = {**_DROP, "valence": Unknown(0.0, sd=1.0), "promiscuity": Unknown(0.0, 
 def nuclides(stride: int = 1) -> pd.DataFrame:
     """Measured nuclides with Z and N of at least 8, of every how many-th Z; in MeV."""
     table = pd.read_csv(DATA)
-    table = table[(table.Z >= 8) & (table.N >= 8) & (table.measured == 1)]
     table = table[table.Z % stride == 0].reset_index(drop=True)
     table["odd Z"], table["odd N"] = table.Z % 2, table.N % 2
     table["near N = Z"] = np.exp(-(table.N - table.Z).abs() / 2)
@@ -98,26 +93,14 @@ def left_out(table: pd.DataFrame, task: str, split: int, seed: int) -> np.ndarra
     return np.asarray(ends & (chains.transform("size") > 2 * k))
 
 
-def build(model: str, physics: FunctionPhysics) -> Callable[..., GP]:
-    """What makes a model of inputs, energies and variances; shells close with kinks."""
-    of_rho, matern = Stationary(MATERN52, RHO), Stationary(MATERN52)
-    makers: dict[str, Callable[..., GP]] = {
-        "cka": lambda X, Y, V: CKA(
-            X, Y, V, physics=physics, rho_covar_module=of_rho, delta_covar_module=matern
-        ),
-        "mean": lambda X, Y, V: PhysicsMeanGP(X, Y, V, physics=physics, covar_module=matern),
-        "gp": lambda X, Y, V: ZeroMeanGP(X, Y, V, covar_module=matern),
-    }
-    return makers[model]
-
-
-def fitted(make: Callable[..., GP], data: Sequence[Tensor], rows: np.ndarray, seed: int) -> GP:
-    """A model of all rows, whose hyper-parameters are those of some of them."""
-    model = make(*data)
-    some: Any = model.subset_rows(torch.from_numpy(rows))
-    fit(some, "map", seed=seed)
-    model.set_draws(some.draws)
-    return model
+def build(model: str, data: Sequence[Tensor], physics: FunctionPhysics) -> Any:
+    """A model of inputs, energies and variances; shells close with kinks."""
+    matern = Stationary(MATERN52)
+    kernels = {"covar_module": matern}
+    if model == "cka":
+        kernels = {"delta_covar_module": matern, "rho_covar_module": Stationary(MATERN52, RHO)}
+    name = {"mean": "phymean"}.get(model, model)
+    return LEARNERS[name].make(*data[:2], train_Yvar=data[2], physics=physics, **kernels)
 
 
 def run(experiment: Masses, task: str, physics: str, model: str, seed: int) -> Run:
@@ -125,19 +108,23 @@ def run(experiment: Masses, task: str, physics: str, model: str, seed: int) -> R
     table = nuclides(experiment.stride)
     out = left_out(table, task, experiment.split, seed)
     train, test = table[~out], table[out]
-    law = FunctionPhysics(
-        shell if physics == "shell" else drop, unknowns=_SHELL if physics == "shell" else _DROP
-    )
+    law = FunctionPhysics(drop, unknowns=_DROP)
+    if physics == "shell":
+        law = FunctionPhysics(shell, unknowns=_SHELL)
     begin = time.perf_counter()
     X, Y, V = _tensors(train)
     order = np.random.default_rng(seed).permutation(len(X))
     rows = np.sort(order[: experiment.num_rows])
     if model in ("alone", "trees"):
         # Known noise is far less than what the formula lacks, so its own noise is learnt.
-        made: GP = CalibratedPhysics(X[rows], Y[rows], physics=law)
+        made: Any = CalibratedPhysics(X[rows], Y[rows], physics=law)
         fit(made, "map", seed=seed)
     else:
-        made = fitted(build(model, law), (X, Y, V), rows, seed)
+        # A model of all rows, whose hyper-parameters are those of some of them.
+        made = build(model, (X, Y, V), law)
+        some = made.subset_rows(torch.from_numpy(rows))
+        fit(some, "map", seed=seed)
+        made.set_draws(some.draws)
     test_X, test_Y, test_V = _tensors(test)
     held = half = None
     with torch.no_grad():
@@ -146,17 +133,17 @@ def run(experiment: Masses, task: str, physics: str, model: str, seed: int) -> R
             mean = mean + _trees(train, Y - made.predict(X).mean, test)
         else:
             noise: Any = True if model == "alone" else test_V
-            lower, upper = made.interval(test_X, observation_noise=noise)
-            held = ((lower <= test_Y) & (test_Y <= upper)).double().mean().item()
-            half = ((upper - lower) / 2).mean().item()
+            low, high = made.interval(test_X, observation_noise=noise)
+            scores = scores_of(mean, low, high, test_Y)
+            held, half = scores["coverage"], scores["half_width"]
+    found = {} if model == "gp" else made.physics_parameters
     return {
-        "train": len(train),
         "test": len(test),
         "mean_square": (mean - test_Y).square().mean().item(),
         "held": held,
         "half_width": half,
         "seconds": time.perf_counter() - begin,
-        "parameters": {} if model == "gp" else _values(made),
+        "parameters": {name: draws.mean().item() for name, draws in found.items()},
     }
 
 
@@ -166,10 +153,6 @@ def _tensors(table: pd.DataFrame) -> tuple[Tensor, Tensor, Tensor]:
         for columns in (_INPUTS, ["energy"], ["sd"])
     )
     return X, Y, sd.square()
-
-
-def _values(model: GP) -> dict[str, float]:
-    return {name: draws.mean().item() for name, draws in model.physics_parameters.items()}
 
 
 def _trees(train: pd.DataFrame, residual: Tensor, test: pd.DataFrame) -> Tensor:
@@ -183,24 +166,24 @@ def _trees(train: pd.DataFrame, residual: Tensor, test: pd.DataFrame) -> Tensor:
 
 def tables(runs: Sequence[Run], experiment: Masses) -> dict[str, Table]:
     """Errors, coverage and half widths of each task, and the parameters."""
-    data = frame(runs)
     axes = experiment.axes
     parts = groups(
-        data, ["physics", "model"], lambda f, m: f"{axes['physics'][f]}, {axes['model'][m]}"
+        frame(runs), ["physics", "model"], lambda f, m: f"{axes['physics'][f]}, {axes['model'][m]}"
     )
     columns = {
-        f"{label}: {what}": _score(task, i, form)
+        f"{label}: {what}": _pooled(task, score, form)
         for task, label in axes["task"].items()
-        for i, (what, form) in enumerate(
-            (("RMSE, MeV", ".3f"), ("95 % hold", ".3f"), ("half width, MeV", ".2f"))
+        for score, what, form in (
+            ("mean_square", "RMSE, MeV", ".3f"),
+            ("held", "95 % hold", ".3f"),
+            ("half_width", "half width, MeV", ".2f"),
         )
     }
     columns["nuclides left out, in folds"] = lambda part: (
-        f"{part[part['task'] == 'fold'].test.sum()} in {(part['task'] == 'fold').sum()}"
+        f"{part_of(part, task='fold').test.sum()} in {len(part_of(part, task='fold'))}"
     )
     columns["seconds of a fit"] = of("seconds", "median", ".0f")
-    text = table(parts, columns, "model")
-    text = with_rows(text, PUBLISHED.items())
+    text = table(parts, columns, "model", [[n, *e] for n, e in published("masses").items()])
     values = {f"{name}, MeV": _parameter(name) for name in _SHELL}
     return {
         "errors": Table("Errors of nuclides that are left out", text),
@@ -208,24 +191,17 @@ def tables(runs: Sequence[Run], experiment: Masses) -> dict[str, Table]:
     }
 
 
-def _score(task: str, place: int, form: str) -> Cell:
-    return lambda part: number(_scores(part[part["task"] == task])[place], form)
+def _pooled(task: str, score: str, form: str) -> Cell:
+    """A score over the nuclides of all runs of a task; of mean squares the root."""
 
-
-def _parameter(name: str) -> Cell:
     def cell(part: pd.DataFrame) -> str:
-        return number(np.mean([run[name] for run in part.parameters if name in run] or [np.nan]))
+        own = part_of(part, task=task)
+        weights = own.test / own.test.sum()
+        mean = float((weights * pd.to_numeric(own[score])).sum(skipna=False, min_count=1))
+        return number(mean**0.5 if score == "mean_square" else mean, form)
 
     return cell
 
 
-def _scores(part: pd.DataFrame) -> tuple[float, float, float]:
-    """Root mean square error, share held and mean half width over the nuclides of all runs."""
-    if not len(part):
-        return (float("nan"),) * 3
-    weights = part.test / part.test.sum()
-    square, held, half = (
-        float((weights * pd.to_numeric(part[name])).sum(skipna=False))
-        for name in ("mean_square", "held", "half_width")
-    )
-    return square**0.5, held, half
+def _parameter(name: str) -> Cell:
+    return lambda part: number(part.parameters.map(lambda values: values.get(name)).mean())

@@ -7,21 +7,21 @@ a factor of 10: the same rule for all sets, fixed before the first run.
 from __future__ import annotations
 
 import re
-import time
-import warnings
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
-from gpadjust import CalibratedPhysics, Unknown, fit
+from gpadjust import CalibratedPhysics, Unknown
 from gpadjust.physics import FormulaPhysics
-from paper.common.experiment import Run, Table
-from paper.common.tables import markdown
-from paper.published import NIST_SETS, Nist
+from paper.common.experiment import Run, Table, fitted
+from paper.common.tables import Cell, groups, markdown, of, table
+from paper.published import Nist
 
 DATA = Path(__file__).parent / "data" / "nist"
 FACTOR = 10.0  # one standard deviation of the prior
@@ -75,6 +75,7 @@ class Reference(NamedTuple):
     sd: Tensor  # p, of the least-squares estimate
 
 
+@cache
 def reference(name: str) -> Reference:
     """Read a data set."""
     text = (DATA / f"{name}.dat").read_text()
@@ -97,49 +98,52 @@ def model_of(name: str, start: int) -> CalibratedPhysics:
 
 
 def run(experiment: Nist, name: str, start: int, seed: int) -> Run:
-    """Fit a set; return means and 95 % intervals of the parameters, and how the fit went."""
-    warnings.simplefilter("ignore")
+    """Fit a set; return means and half widths of 95 % intervals of the parameters."""
     data, model = reference(name), model_of(name, start)
-    begin = time.perf_counter()
-    result = fit(model, seed=seed)
-    seconds = time.perf_counter() - begin
+    seconds = fitted(model, seed=seed)
     found, factor = model.physics_parameters, data.starts[start - 1]
     low, high = (end * factor for end in found.interval())
     return {
         "mean": (found.mean * factor).tolist(),
         "half": ((high - low) / 2).abs().tolist(),
-        "error": result.parameter_error,
         "seconds": seconds,
     }
 
 
 def tables(runs: Sequence[Run], experiment: Nist) -> dict[str, Table]:
     """All tables, by name."""
-    rows, good = [], []
-    for name in NIST_SETS:
-        own = [run for run in runs if run["name"] == name]
-        if not own:
-            continue
-        data = reference(name)
-        off = [((torch.tensor(run["mean"]) - data.value) / data.sd).abs().max() for run in own]
-        wide = [torch.tensor(run["half"]) / 1.96 / data.sd for run in own]
-        low, high = (min(each.min() for each in wide), max(each.max() for each in wide))
-        is_near, is_wide = bool(max(off) < 1), bool(low > 1 / WIDE and high < WIDE)
-        good.append(is_near and is_wide)
-        cells = [name, len(data.X), len(data.value)]
-        cells += [
-            f"{max(off[i] for i, run in enumerate(own) if run['start'] == s):.2g}" for s in (1, 2)
-        ]
-        cells += [f"{low:.2g} to {high:.2g}", "yes" if good[-1] else "no"]
-        cells.append(f"{sum(run['seconds'] for run in own) / len(own):.1f}")
-        rows.append([*map(str, cells)])
-    header = ["set", "rows", "parameters", "farthest value, start 1", "farthest value, start 2"]
-    header += ["widths", "both hold", "seconds"]
-    summary = [["sets", str(len(good))], ["within both limits", str(sum(good))]]
+    columns: dict[str, Cell] = {
+        "rows": of("rows", "max", ".0f"),
+        "parameters": of("parameters", "max", ".0f"),
+        "farthest value, start 1": of("off", "max", ".2g", start=1),
+        "farthest value, start 2": of("off", "max", ".2g", start=2),
+        "widths": lambda part: f"{part['least'].min():.2g} to {part['most'].max():.2g}",
+        "both hold": lambda part: "yes" if _both_hold(part) else "no",
+        "seconds": of("seconds", "mean", ".1f"),
+    }
+    parts = groups(load(runs), "name", experiment.axes["name"])
+    good = sum(map(_both_hold, parts.values()))
+    summary = [["sets", f"{len(parts)}"], ["within both limits", f"{good}"]]
+    title = "Distance from the certified values and widths, in standard errors"
     return {
-        "sets": Table(
-            "Distance from the certified values and widths, in standard errors",
-            markdown(header, rows),
-        ),
+        "sets": Table(title, table(parts, columns, "set")),
         "summary": Table("How many sets", markdown(["", "number"], summary)),
     }
+
+
+def _both_hold(part: pd.DataFrame) -> bool:
+    widths = part["least"].min() > 1 / WIDE and part["most"].max() < WIDE
+    return bool(part["off"].max() < 1 and widths)
+
+
+def load(runs: Sequence[Run]) -> pd.DataFrame:
+    """The farthest value of each run and its narrowest and widest interval, in standard errors."""
+    rows = []
+    for run in runs:
+        data = reference(run["name"])
+        off = ((torch.tensor(run["mean"]) - data.value) / data.sd).abs().max().item()
+        width = torch.tensor(run["half"]) / 1.96 / data.sd
+        row = {"rows": len(data.X), "parameters": len(data.value), "off": off}
+        row |= {"least": width.min().item(), "most": width.max().item()}
+        rows.append(row | {key: run[key] for key in ("name", "start", "seconds")})
+    return pd.DataFrame(rows)

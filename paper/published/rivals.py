@@ -1,8 +1,10 @@
-"""Other people's models with a formula beside their inputs: what a practitioner tries first."""
+"""Other people's models with a formula beside their inputs, and how they and ours are judged."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -20,6 +22,8 @@ from torch import Tensor, nn
 
 from gpadjust import CalibratedPhysics, fit
 from gpadjust.physics import Physics
+from gpadjust.validation import score
+from paper.common.learners import LEARNERS
 from paper.machines.networks import Networks
 
 Predict = Callable[[Tensor], Posterior]
@@ -118,30 +122,23 @@ def ensemble(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
     return predict
 
 
-class SMTModel:
-    """SMT's MFK with its defaults, trained, with BoTorch's way to ask for predictions.
+def smt(low_X: Tensor, low_Y: Tensor, X: Tensor, Y: Tensor) -> Predict:
+    """Train SMT's MFK with its defaults; its predictions have no observation noise."""
+    from smt.applications import MFK  # slow to import
 
-    Args:
-        low_X: Inputs of the low level, ``n_1 x d``, among them those of the high one.
-        low_Y: Its values, ``n_1 x 1``.
-        train_X: Inputs of the high level, ``n x d``.
-        train_Y: Its values, ``n x 1``.
-    """
+    model = MFK(print_global=False)
+    model.set_training_values(low_X.numpy(), low_Y.numpy(), name=0)
+    model.set_training_values(X.numpy(), Y.numpy())
+    model.train()
 
-    def __init__(self, low_X: Tensor, low_Y: Tensor, train_X: Tensor, train_Y: Tensor) -> None:
-        from smt.applications import MFK  # slow to import
+    def predict(test: Tensor) -> Posterior:
+        mean, variance = (
+            torch.as_tensor(moment(test.numpy())).squeeze(-1)
+            for moment in (model.predict_values, model.predict_variances)
+        )
+        return gaussian(mean, variance.clamp_min(_LEAST_VARIANCE))
 
-        self.mfk = MFK(print_global=False)
-        self.mfk.set_training_values(low_X.numpy(), low_Y.numpy(), name=0)
-        self.mfk.set_training_values(train_X.numpy(), train_Y.numpy())
-        self.mfk.train()
-
-    def posterior(self, X: Tensor, observation_noise: bool = False) -> GPyTorchPosterior:
-        """Independent predictions at ``q x d`` inputs; the model has no observation noise."""
-        mean = torch.as_tensor(self.mfk.predict_values(X.numpy())).squeeze(-1)
-        variance = torch.as_tensor(self.mfk.predict_variances(X.numpy())).squeeze(-1)
-        covariance = DiagLinearOperator(variance.clamp_min(_LEAST_VARIANCE))
-        return GPyTorchPosterior(MultivariateNormal(mean, covariance))
+    return predict
 
 
 def mfk(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
@@ -155,8 +152,7 @@ def mfk(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
     more = np.stack([draw.permutation(column) for column in X.numpy().T], -1)
     low = torch.cat([X, torch.from_numpy(more)])
     with torch.no_grad():
-        model = SMTModel(low, formula.predict(low).mean, X, Y)
-    return lambda test: model.posterior(test)
+        return smt(low, formula.predict(low).mean, X, Y)
 
 
 RIVALS: dict[str, Callable[..., Predict]] = {
@@ -166,6 +162,44 @@ RIVALS: dict[str, Callable[..., Predict]] = {
     "ensemble": ensemble,
     "mfk": mfk,
 }
+
+
+def ours(learner: str, **options: Any) -> Callable[..., Predict]:
+    """What fits one of our learners by the default; its predictions are of observations."""
+
+    def fitted(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
+        model = LEARNERS[learner].make(X, Y, physics=physics, **options)
+        fit(model, seed=seed)
+        return partial(model.posterior, observation_noise=True)
+
+    return fitted
+
+
+def judged(
+    fitted: Callable[..., Predict],
+    data: Sequence[Tensor],
+    physics: Physics,
+    *,
+    seed: int,
+    is_centred: bool,
+) -> dict[str, float]:
+    """Fit a method to training rows, less their mean if asked for; return scores on test rows."""
+    X, Y, test_X, test_Y = data
+    shift = Y.mean() if is_centred else torch.zeros(())
+    begin = time.perf_counter()
+    predict = fitted(X, Y - shift, physics, seed=seed)
+    seconds = time.perf_counter() - begin
+    with torch.no_grad():
+        posterior = predict(test_X)
+        scores = score(posterior, test_Y - shift)
+    error = posterior.mean.reshape(-1, 1) - (test_Y - shift)
+    return {
+        "mae": error.abs().mean().item(),
+        "rmse": scores.rmse.item(),
+        "density": -scores.nlpd.item(),
+        "coverage": scores.coverage.item(),
+        "seconds": seconds,
+    }
 
 
 def gaussian(mean: Tensor, variance: Tensor) -> GPyTorchPosterior:

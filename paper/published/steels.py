@@ -7,10 +7,7 @@ inputs and kernel were tried by five folds of the training rows of the first fol
 
 from __future__ import annotations
 
-import time
-import warnings
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -18,36 +15,16 @@ import torch
 from gpytorch.kernels import Kernel, MaternKernel, ScaleKernel
 from torch import Tensor
 
-from gpadjust import (
-    CKA,
-    CalibratedPhysics,
-    FunctionPhysics,
-    PhysicsMeanGP,
-    Unknown,
-    ZeroMeanGP,
-    fit,
-)
-from gpadjust.core import GP, SamplingWarning
+from gpadjust import FunctionPhysics, Unknown
 from gpadjust.physics import ParameterValues
-from gpadjust.validation import score
 from paper.common.experiment import Run, Table
-from paper.common.tables import Cell, frame, groups, number, of, table, with_rows
-from paper.common.verdicts import Difference
-from paper.published import Steels
-from paper.published.rivals import RIVALS
+from paper.common.tables import Cell, frame, groups, mean_error, of, table
+from paper.published import Steels, published
+from paper.published.rivals import RIVALS, judged, ours
 
 DATA = Path(__file__).parent / "data" / "steels" / "steels.csv"
 ELEMENTS = ("Al", "C", "Co", "Cr", "Mn", "Mo", "N", "Nb", "Ni", "Si", "Ti", "V", "W")
 TRACE = 0.001  # a mole fraction below which an element is a trace
-PUBLISHED = {
-    "AutoML-Mat": 82.3,
-    "TPOT-Mat": 79.9,
-    "MODNet": 87.8,
-    "random forest": 103.5,
-    "CrabNet": 107.3,
-    "mean of the training rows": 229.7,
-}
-"""Mean absolute errors in MPa over the five folds, of the leaderboard of Matbench (936176d)."""
 
 
 def strength(X: Tensor, p: ParameterValues) -> Tensor:
@@ -89,12 +66,13 @@ def kernel() -> Kernel:
     return ScaleKernel(rough) + ScaleKernel(smooth)
 
 
-MODELS: dict[str, Callable[..., GP]] = {
-    "formula": CalibratedPhysics,
-    "phymean": lambda X, Y, physics: PhysicsMeanGP(X, Y, physics=physics, covar_module=kernel()),
-    "cka": lambda X, Y, physics: CKA(X, Y, physics=physics, delta_covar_module=kernel()),
-    "gp": lambda X, Y, physics: ZeroMeanGP(X, Y, covar_module=kernel()),
+KERNELS = {
+    "formula": (),
+    "phymean": ("covar_module",),
+    "cka": ("delta_covar_module",),
+    "gp": ("covar_module",),
 }
+"""Arguments of each model that are the kernel above."""
 
 
 def split(fold: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -111,48 +89,22 @@ def split(fold: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def run(experiment: Steels, method: str, seed: int) -> Run:
     """Fit a method to the training rows of a fold; return its scores on the test rows."""
-    warnings.simplefilter("ignore", SamplingWarning)
-    X, Y, test_X, test_Y = split(seed)
+    fitted = RIVALS.get(method) or ours(method, **{name: kernel() for name in KERNELS[method]})
     physics = FunctionPhysics(strength, unknowns=UNKNOWNS)
-    shift = Y.mean() if method == "gp" else torch.zeros(())
-    begin = time.perf_counter()
-    if method in RIVALS:
-        predict = RIVALS[method](X, Y, physics, seed=seed)
-    else:
-        model = MODELS[method](X, Y - shift, physics=physics)
-        fit(model, seed=seed)
-        predict = partial(model.posterior, observation_noise=True)
-    seconds = time.perf_counter() - begin
-    with torch.no_grad():
-        posterior = predict(test_X)
-        scores = score(posterior, test_Y - shift)
-    error = posterior.mean.reshape(-1, 1) - (test_Y - shift)
-    return {
-        "mae": error.abs().mean().item(),
-        "rmse": scores.rmse.item(),
-        "density": -scores.nlpd.item(),
-        "coverage": scores.coverage.item(),
-        "seconds": seconds,
-    }
+    return judged(fitted, split(seed), physics, seed=seed, is_centred=method == "gp")
 
 
 def tables(runs: Sequence[Run], experiment: Steels) -> dict[str, Table]:
     """Mean absolute errors over the folds, beside published ones."""
-
-    def over_folds(part: pd.DataFrame) -> str:
-        found = Difference.of(part["mae"])
-        return f"{found.mean:.1f} ± {found.error:.1f}"
-
     columns: dict[str, Cell] = {
-        "mean absolute error, MPa": over_folds,
+        "mean absolute error, MPa": mean_error("mae", ".1f"),
         "folds": len,
-        "worst fold, MPa": lambda part: number(part["mae"].max(), ".1f"),
+        "worst fold, MPa": of("mae", "max", ".1f"),
         "RMSE, MPa": of("rmse", "mean", ".1f"),
         "95 % hold": of("coverage", "mean", ".3f"),
         "seconds of a fit": of("seconds", "median", ".0f"),
     }
     rows = groups(frame(runs), "method", experiment.axes["method"])
-    text = table(rows, columns, "method")
-    published = sorted(PUBLISHED.items(), key=lambda pair: pair[1])
-    text = with_rows(text, [[f"{name}, published", f"{error}"] for name, error in published])
+    more = [[f"{name}, published", *error] for name, error in published("steels").items()]
+    text = table(rows, columns, "method", more)
     return {"errors": Table("312 steels, five fixed folds", text)}

@@ -21,7 +21,6 @@ from gpadjust.physics import ParameterValues
 
 DATA = Path(__file__).parent / "data" / "uci"
 _OUTPUTS = {"yacht": "residuary_resistance", "energy": "heating_load", "concrete": "strength"}
-_UNUSED = "cooling_load"  # energy's other output
 
 
 def resistance(X: Tensor, p: ParameterValues) -> Tensor:
@@ -98,7 +97,7 @@ class Split(NamedTuple):
 
 @cache
 def _read(table: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rows = pd.read_csv(DATA / f"{table}.csv").drop(columns=_UNUSED, errors="ignore")
+    rows = pd.read_csv(DATA / f"{table}.csv")
     test = pd.read_csv(DATA / f"{table}_test.csv").to_numpy() == 1
     output = _OUTPUTS[table]
     return rows.drop(columns=output).to_numpy(float), rows[[output]].to_numpy(float), test

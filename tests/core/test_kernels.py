@@ -13,6 +13,7 @@ from gpytorch.priors import GammaPrior, LogNormalPrior, UniformPrior
 
 from gpadjust import core
 from gpadjust.core import CKA, GP, Kernel, Noise, Stationary, Term, ZeroMeanGP, fit
+from gpadjust.kinds import HeavyTails
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.systems import wave
 
@@ -113,6 +114,23 @@ class Growing(Noise):
     def shares(self, places):
         x = places.X[..., 0]
         return torch.stack([torch.ones_like(x), x.square()], -1)
+
+
+class OfTargets(Noise):
+    """A noise with a prior around a tenth of the spread of the targets."""
+
+    def of_data(self, data, terms):
+        sd = 0.1 * data.Y.std().item() / terms.unit.item()
+        return Noise(priors=[core.LogNormal(sd**2, 2.0)])
+
+
+@pytest.mark.parametrize("noise", [OfTargets(), HeavyTails(base=OfTargets())])
+def test_a_noise_has_a_prior_by_the_data(data, noise):
+    X, Y = data
+    model = CKA(X, Y, physics=wave, noise=noise)
+    variance = model.likelihood.noise.detach()
+    expected = (0.1 * Y.std()).expand_as(variance)
+    torch.testing.assert_close(variance.sqrt(), expected, rtol=1e-6, atol=0.0)
 
 
 def test_a_noise_reads_inputs_as_the_user_gave_them(data):

@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 import torch
-from botorch.models import SingleTaskGP
+from botorch.models import ModelListGP, SingleTaskGP
 from botorch.models.transforms.input import AppendFeatures, InputPerturbation, Warp
 from botorch.sampling import SobolQMCNormalSampler
 from gpytorch.kernels import RBFKernel
@@ -59,6 +59,8 @@ def stacked(models, weights, *number):
 
 
 PAIR = {"a": MODEL, "b": ZERO}
+LIST = ModelListGP(MODEL, ZERO)
+SINGLE = torch.float32
 REFUSED = [
     # Data and options.
     (lambda: cka(kernel=None), TypeError, "'kernel' of CKA; expected some of center, .*, rho_mean"),
@@ -94,6 +96,14 @@ REFUSED = [
     ),
     (lambda: ZERO.rho(X), ValueError, "Unknown term 'rho'; expected one of f"),
     (lambda: core.save("a comparison", "model.pt"), TypeError, "comparison.recommended"),
+    (lambda: core.save(LIST, "model.pt"), TypeError, "found ModelListGP.*each of model.models"),
+    (lambda: ZERO.set_train_data(X, Y), NotImplementedError, "condition_on_observations"),
+    (lambda: ZERO.to(SINGLE), TypeError, "compute in float64; found torch.float32"),
+    (lambda: ZERO.to("cpu", dtype=SINGLE), TypeError, "float64; found torch.float32"),
+    (lambda: ZERO.to(X.to(SINGLE)), TypeError, "float64; found torch.float32"),
+    (lambda: ZERO.float(), TypeError, "float64; found torch.float32"),
+    (lambda: stacked(PAIR, [0.5, 0.5]).to(SINGLE), TypeError, "float64; found torch.float32"),
+    (lambda: stacked(PAIR, [0.5, 0.5]).half(), TypeError, "float64; found torch.float16"),
     (lambda: NAMED.predict(pd.DataFrame({"a": [0.1], "b": [0.2]})), ValueError, "columns"),
     (lambda: NAMED.predict(pd.DataFrame({"b": [0.1], "c": [0.2]})), ValueError, "columns"),
     (lambda: MODEL.interval(X, 95), ValueError, "between 0 and 1"),
@@ -142,6 +152,8 @@ REFUSED = [
     (lambda: fit(ZERO, "vi"), ValueError, "Unknown method 'vi'"),
     (lambda: fit(ZERO, num_draws=6), ValueError, "multiple of 4"),
     (lambda: fit(ZERO, num_draws=0), ValueError, "multiple of 4"),
+    (lambda: fit(ZERO, num_draws=8.0), TypeError, "num_draws must be a whole number; found 8.0"),
+    (lambda: fit(LIST), TypeError, "found ModelListGP.*for part in model.models"),
     (lambda: fit(fantasy()), ValueError, "one data set"),
     (lambda: fit(SingleTaskGP(X, Y, outcome_transform=None)), TypeError, "SingleTaskGP"),
     (lambda: fit(MODEL, "nuts"), ValueError, "nested=False"),
@@ -170,3 +182,15 @@ REFUSED = [
 @pytest.mark.filterwarnings("ignore:Data .outcome observations. is not standardized")
 def test_refused(call, error, words):
     refused(error, words, call)
+
+
+def test_a_refused_type_changes_nothing():
+    for model in (ZERO, MODEL):
+        before = model.predict(X)
+        for move in (model.float, model.half, lambda model=model: model.to(SINGLE)):
+            with pytest.raises(TypeError, match="float64"):
+                move()
+        assert model.u.dtype == torch.float64
+        after = model.double().to("cpu").to(X).to(torch.float64).predict(X)
+        assert torch.equal(after.mean, before.mean)
+        assert torch.equal(after.variance, before.variance)

@@ -15,6 +15,7 @@ from torch.nn.functional import relu, silu
 from gpadjust import core
 from gpadjust.core import CKA, GP, MATERN52, KnownNoise, Stationary, ZeroMeanGP, load, save
 from gpadjust.core.saving import _built_with
+from gpadjust.kinds import Vanishing
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
 from tests.core.noises import Relative
 from tests.systems import normal, refused, uniform
@@ -71,6 +72,12 @@ def terms():
 
 
 CHOICES = [core.Choice("all", 0.5), core.Choice("no f", 0.5, ("f.process", "f.constant"))]
+CONSTANTS = {"rho": core.LogNormal(0.02, 90.0)}
+NESTED = [core.Choice("all", 0.5), core.Choice("a factor", 0.5, ("rho.process", "delta.process"))]
+EXTRA = [
+    core.Term("zero at 0", Vanishing({0: 0.0})),
+    core.Term("slope", constant=core.LogNormal(1.0, 10.0)),
+]
 OF_USERS = {"noise": Relative(), "input_transform": Normalize(2)}
 # Models, and the objects that their files do not contain.
 MODELS = {
@@ -91,9 +98,12 @@ MODELS = {
     "known noise": (partial(CKA, X, Y, physics=relu), {"noise": KnownNoise(torch.rand_like(Y.mT))}),
     "terms": (partial(GP, X, Y, physics=[relu]), {"terms": terms()}),
     "choices": (
-        partial(GP, X, Y, physics=[relu]),
-        {"terms": terms(), "choices": CHOICES, **OF_USERS},
+        partial(GP, X, Y, physics=[relu], choices=CHOICES),
+        {"terms": terms(), **OF_USERS},
     ),
+    "extra terms": (partial(CKA, X, Y, physics=relu, extra_terms=EXTRA), {}),
+    "extra terms of a kernel": (partial(CKA, X, Y, physics=relu), {"extra_terms": terms()[:1]}),
+    "own nested": (partial(CKA, X, Y, physics=relu, nested=NESTED, constants=CONSTANTS), {}),
     "known": (partial(GP, X, Y, 0.1), {"terms": terms()[:1]}),
 }
 
@@ -151,6 +161,17 @@ def bad(tensor):
 
 MODEL = drawn(CKA(X, Y, physics=relu))
 CHECKS = _built_with(MODEL, 7)
+
+
+def nested(*probabilities, kind="Choice"):
+    """Return the content of a file for the nested models of the model with other probabilities."""
+    choices = zip(MODEL.table.choices, probabilities, strict=True)
+    settings = [choice._asdict() | {"probability": p} for choice, p in choices]
+    return {
+        "nested": [{"class": f"gpadjust.core.unknowns:{kind}", "settings": s} for s in settings]
+    }
+
+
 # Changes of the content of a file, at which None deletes, and the words of the error.
 BAD_FILES = {
     "NaN u": ({"u": bad(MODEL.u.detach())}, "finite coord"),
@@ -175,6 +196,8 @@ BAD_FILES = {
     "no model": ({"class": "builtins:dict"}, "import its module first"),
     "not imported": ({"class": "antigravity:GP"}, "import its module first"),
     "other settings": ({"settings": {"nested": False}}, "another prior of choice"),
+    "other choices": ({"settings": nested(0.5, 0.3, 0.2)}, "another choice your formula corrected"),
+    "a class of no part": ({"settings": nested(0.45, 0.35, 0.2, kind="Row")}, "no class .*Row"),
     "other priors": ({"settings": {"rho_mean": 0.5}}, "another mean"),
     "unknown settings": ({"settings": {"gain": 2.0}}, "wrong one"),
     "a path of code": ({"physics": ["antigravity:geohash"]}, "is the code antigravity"),
@@ -213,8 +236,6 @@ SILU = partial(CKA, X, Y, physics=silu)
 KERNEL = {"delta_covar_module": Stationary(MATERN52), "noise": core.Noise()}
 OTHER_KERNEL = {"delta_covar_module": Stationary(core.MATERN32), "noise": core.Noise()}
 KNOWN = {"terms": terms(), "noise": KnownNoise(torch.ones_like(Y.mT))}
-CHOSEN = {"terms": terms(), "choices": CHOICES}
-OTHER = [CHOICES[0]._replace(probability=0.6), CHOICES[1]._replace(probability=0.4)]
 WIDER = [terms()[0]._replace(constant=core.LogNormal(1.0, 11.0)), terms()[1]]
 OF_RELU = partial(GP, X, Y, physics=[relu])
 # A model, the objects that it is loaded with, and the words of the error.
@@ -229,7 +250,6 @@ WRONG_OBJECTS = [
     (SILU, KERNEL, {"physics": silu} | KERNEL | {"noise": 3}, "wrong one"),
     (OF_RELU, KNOWN, KNOWN | {"noise": KnownNoise(2 * torch.ones_like(Y.mT))}, "another noise"),
     (OF_RELU, KNOWN, KNOWN | {"terms": WIDER}, "another prior"),
-    (OF_RELU, CHOSEN, CHOSEN | {"choices": OTHER}, "another choice all"),
 ]
 
 

@@ -9,9 +9,9 @@ import torch
 from threadpoolctl import threadpool_info
 
 from gpadjust.core import CKA, RRA, StackedGP, ZeroMeanGP, fit
-from gpadjust.core.threads import threads_for
 from gpadjust.kinds import AR1, LinkedCKA
 from gpadjust.physics import FunctionPhysics, Unknown
+from gpadjust.threads import threads_for
 from tests.systems import ripple, same, uniform
 
 

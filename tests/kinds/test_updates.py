@@ -93,12 +93,12 @@ def test_what_is_long_ago_fades_to_the_prior():
     kalman, values = Kalman(model, forget=tau), model.values
     for _ in range(10):
         kalman.update(x, wave(x))
-    rho = model.term_sum.term("rho", values, model.places(AT, values, with_physics=False))
+    rho = model.term_sum.term("rho", values, model.places(AT, values, f=()))
     one, phi = design(model.evaluate(x[:1], values)), design(rho)
     weight = 1 / (1 - math.exp(-1 / tau)) / model.conditioning().noise[..., :1]
     lost = (phi @ one.mT).squeeze(-1).square() / (1 / weight + one.square().sum(-1))
     expected = phi.square().sum(-1) - lost
-    torch.testing.assert_close(kalman.weights.marginals(rho)[1], expected, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(kalman.weights.moments(rho)[1], expected, rtol=1e-5, atol=1e-7)
     assert (kalman.predict(x[:1]).mean - wave(x[:1])).abs() < 0.1
 
 

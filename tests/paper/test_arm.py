@@ -11,7 +11,7 @@ from paper.arm import Arm, evaluation
 from paper.arm.arm import load_maps
 from paper.arm.claims import claims as arm_claims
 from paper.arm.claims import distance_from_start
-from paper.arm.evaluation import hundred, reach, score
+from paper.arm.evaluation import reach, score
 from paper.cartpole.control import load
 from paper.common.runner import main, runs_file
 from paper.common.verdicts import Curves, judge
@@ -70,7 +70,6 @@ class TestArm:
         scores = score(np.tile(np.arange(1.0, 8.0), (3, 1)))
         assert scores["all_steps"] == pytest.approx(np.sqrt(20.0) * np.ones(3))
         assert scores["last_five"] == pytest.approx(np.sqrt(27.0) * np.ones(3))
-        assert hundred().sum() == 100
         assert np.sqrt(np.square(distance_from_start()).mean()) == pytest.approx(34, abs=0.5)
 
     @pytest.mark.slow
@@ -79,7 +78,7 @@ class TestArm:
         experiment = replace(
             TINY_ARM,
             evaluate_every=2,
-            map_after=9,
+            map_after=2,
             out=tmp_path,
             runs=2,
             jobs=1,
@@ -91,7 +90,6 @@ class TestArm:
         record = runs_file(experiment).read()["cka", 1]
         assert record["evaluations"]["episode"] == [0, 2]
         assert len(record["maps"]["2"]["last_five"]) == 4
-        assert record["episodes"]["updates"] == [5 + 2 * 5] * 2
 
     def test_verdicts_follow_the_numbers(self):
         found = arm_verdicts(

@@ -335,8 +335,8 @@ def test_a_broken_opensim_says_so_itself(tmp_path, monkeypatch, content, message
     assert "pip install" not in str(error.value)
 
 
-def test_the_system_with_memory_and_noise():
-    reaching = system.arm(memory=True, noise={"theta_s": 0.01}, strength=0.3)
+def test_the_system_with_memory():
+    reaching = system.arm(memory=True, strength=0.3)
     assert reaching.spec is ARM_MEMORY_SPEC
     env = reaching.make()
     observation, _ = env.reset(seed=0)

@@ -90,9 +90,6 @@ class Squares(Experiment):
     def run(self, *case):
         return {"value": self.factor * (case[1] + 1.0) * (case[0] == "a")}
 
-    def first_look(self, runs):
-        return None
-
     def tables(self, runs):
         return {"runs": Table("Runs", f"{len(runs)}")}
 

@@ -16,13 +16,12 @@ from paper.common.runner import runs_file, tables_of
 from paper.common.runs import differences
 from paper.common.tables import (
     across,
-    aligned,
     claims_table,
     filled,
     fragments,
     frame,
     groups,
-    markdown,
+    mean_error,
     of,
     table,
 )
@@ -122,12 +121,10 @@ def test_claims_are_judged_by_the_seeds_that_all_their_scenarios_have():
     }
 
 
-def test_tables():
-    table = markdown(["a", "b"], [["1", "long"], ["22", ""]])
-    assert aligned(f"title\n\n{table}") == "title\n\na   b\n--  ----\n1   long\n22"
+def test_tables_of_claims():
     one, other = Judged("F1", "c", "beaten", "x"), Judged("F1", "c", "beaten", "y")
-    assert "| **beaten**: x | **beaten**: y |" in claims_table("claim", {"p": [one], "q": [other]})
-    assert "| **beaten**: x | the same |" in claims_table("claim", {"p": [one], "q": [one]})
+    assert "| **beaten**: x | **beaten**: y |" in claims_table({"p": [one], "q": [other]})
+    assert "| **beaten**: x | the same |" in claims_table({"p": [one], "q": [one]})
 
 
 def test_tables_of_runs():
@@ -142,9 +139,12 @@ def test_tables_of_runs():
     assert [*runs] == ["kind", "learner", "seed", "error"]
     rows = groups(runs, "kind", {"a": "A", "b": "B", "c": "C"})
     columns = across(runs, "learner", {"cka": "CKA", "gp": "GP"}, of("error", "mean", ".2g"))
-    shown = table(rows, columns, "error", bold=True)
+    shown = table(rows, columns, "error", [["C", "9"]])
     assert shown.splitlines()[0] == "| error | CKA | GP |"
-    assert shown.splitlines()[2:] == ["| A |  | **0.5** |", "| B | 0.2 | **0.12** |"]
+    assert shown.splitlines()[2:] == ["| A |  | 0.5 |", "| B | 0.2 | 0.12 |", "| C | 9 |  |"]
+    assert of("error", "max", ".1f", learner="cka")(runs) == "0.3"
+    assert mean_error("error", ".2f", ".1g", counted=True, learner="cka")(runs) == "0.20 ± 0.1 (2)"
+    assert mean_error("error", ".2f", kind="a")(runs) == "0.50"
     assert [*groups(runs, ["kind", "learner"], "{} by {}".format)] == [
         "b by gp",
         "b by cka",

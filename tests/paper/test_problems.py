@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from torch.testing import assert_close
 
 from gpadjust.dynamics import PhysicsDynamics, Trajectories
-from paper.control.systems import SYSTEMS as KNOWN
+from paper.control.systems import MACHINES as KNOWN
 from paper.forrester.problem import forrester
 from paper.functions import PROBLEMS as GROUPS
 from paper.functions.functions import data_of
@@ -24,11 +24,11 @@ from paper.parameters import TEXTBOOK, Parameters
 from paper.parameters.laws import PROBLEMS as LAWS
 from paper.parameters.laws import case
 from paper.published import TABLES, Emps
-from paper.published.emps import measured, physics
+from paper.published.emps import measured, physics, spec_of
 from paper.published.freeruns_systems import SYSTEMS as RECORDS
 from paper.published.freeruns_systems import narx_spec, records
 from paper.published.masses import drop, left_out, nuclides, shell
-from paper.published.rivals import SMTModel, fitted_formula
+from paper.published.rivals import fitted_formula, smt
 from paper.published.uci_tables import DATA as UCI
 from paper.published.uci_tables import physics as formula
 from paper.published.uci_tables import split
@@ -71,7 +71,7 @@ def test_classical_functions_are_those_of_others():
 def test_data_of_functions(group):
     """Formulas are right or not as their group says, and the noise is what it says."""
     for name in GROUPS[group]:
-        data = data_of(group, name, 400, 300, 3)
+        data = data_of(name, 400, 300, 3)
         assert data.X.shape[1] <= 3
         assert data.truth.isfinite().all()
         if group == "law":
@@ -135,14 +135,14 @@ def test_mfk_predicts_in_the_units_of_the_data():
     problem = PROBLEMS["booth"]
     X, low = problem.points(10, 0), problem.points(40, 1)
     low = torch.cat([X, low])
-    posterior = SMTModel(low, problem.physics(low), X, problem.truth(X)).posterior(X)
+    posterior = smt(low, problem.physics(low), X, problem.truth(X))(X)
     assert_close(posterior.mean, problem.truth(X), rtol=1e-2, atol=1e-2)
 
 
 def test_the_servo_is_in_metres_and_newtons_and_dry_friction_holds_it():
-    part = measured("estimation", Emps())
-    assert (part.q.min(), part.q.max()) == pytest.approx((0.0, 0.25), abs=0.005)
-    assert (part.step, len(part.q)) == (0.025, 993)
+    q, force = measured("estimation", Emps())
+    assert (q.min(), q.max()) == pytest.approx((0.0, 0.25), abs=0.005)
+    assert (spec_of(Emps()).step, len(q), len(force)) == (0.025, 993, 993)
     rest = torch.tensor([[0.1, 0.0, 15.0], [0.1, 0.0, 40.0]], dtype=torch.float64)
     following = physics(0.025, [95.0, 200.0, 20.0, 0.0])(rest)
     assert_close(following[0], rest[0, :2])
@@ -249,9 +249,9 @@ def test_sensor_without_bend_is_torricelli():
 @pytest.mark.filterwarnings("ignore:.*WARN.*")
 @pytest.mark.parametrize("name", KNOWN)
 def test_true_physics_is_the_environment_and_the_crude_one_is_not(name):
-    true, crude = (KNOWN[name](kind) for kind in ("true", "crude"))
+    true, crude = (KNOWN[name].system(kind) for kind in ("true", "crude"))
     env, spec = true.make(), true.spec
-    check_env(KNOWN[name]("crude").make(), skip_render_check=True)
+    check_env(crude.make(), skip_render_check=True)
     assert pickle.loads(pickle.dumps(true)).spec == spec
     env.action_space.seed(0)
     observation, _ = env.reset(seed=1)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from paper.published import NIST_SETS, Nist
-from paper.published.nist import FORMULAS, WIDE, model_of, reference, run
+from paper.published.nist import FORMULAS, WIDE, model_of, reference
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*rows equal an earlier row")
 
@@ -33,7 +33,7 @@ def test_formulas_and_certified_values_agree(name):
 )
 @pytest.mark.parametrize("start", [1, 2])
 def test_values_and_intervals_are_the_certified_ones(name, start):
-    data, found = reference(name), run(Nist(), name, start, 0)
+    data, found = reference(name), Nist().run(name, start, 0)
     assert ((torch.tensor(found["mean"]) - data.value).abs() < data.sd).all()
     widths = torch.tensor(found["half"]) / 1.96 / data.sd
     assert (widths > 1 / WIDE).all()

@@ -57,19 +57,11 @@ class MuscleArmEnv(ViewedEnv):
 
     Environments can be pickled at any time and go on as they were, with their random state.
 
-    Note:
-        OpenSim holds the activation time constants of the first muscle that a process evaluates
-        for all others of that process, those of other models included.
-
     Args:
         render_mode: ``"rgb_array"``, which needs ``pygame-ce``.
         strength: The factor on the forces of the muscles, in (0, 2]. Electrical stimulation
             recruits part of a muscle; 1 is a healthy arm's.
         accuracy: The relative accuracy of the integrator, in (0, 1).
-
-    Raises:
-        ImportError: If ``opensim`` is missing.
-        ValueError: If an argument is out of its range.
 
     Example:
         >>> import gymnasium

@@ -1,4 +1,4 @@
-"""The arm in OpenSim: models with muscles or with torques, their integration, a physics."""
+"""The arm in OpenSim: a model with muscles, and its integration."""
 
 from __future__ import annotations
 
@@ -89,11 +89,11 @@ def build_muscle_arm(equation: ArmEquation, strength: float) -> Any:
     """The links of an equation with six muscles, of which four are excited.
 
     The state of this ``opensim.Model`` is angles, velocities and six activations; its inputs are
-    the excitations, see :func:`controls`. The strength is a factor on the forces of the muscles.
+    the excitations. The strength is a factor on the forces of the muscles.
     """
     checked_number("strength", strength, above=0, most=MAX_STRENGTH)
     opensim = load_opensim()
-    model = _skeleton(opensim, equation)
+    model = skeleton(opensim, equation)
     for joint, (low, high) in zip(JOINTS, LIMITS, strict=True):
         limit = opensim.CoordinateLimitForce(joint, high, 1.0, low, 1.0, 0.05, 10.0)
         limit.setName(f"{joint}_limit")
@@ -101,41 +101,11 @@ def build_muscle_arm(equation: ArmEquation, strength: float) -> Any:
     muscles = [_muscle(opensim, muscle, strength) for muscle in MUSCLES]
     for muscle in muscles:
         model.addForce(muscle)
-    _add_controller(opensim, model, muscles[:NUM_EXCITED])
+    add_controller(opensim, model, muscles[:NUM_EXCITED])
     return model
 
 
-def build_torque_arm(equation: ArmEquation) -> Any:
-    """The links of an equation, whose inputs are torques at both joints, in N m; without limits.
-
-    The state of this ``opensim.Model`` is angles and velocities.
-    """
-    opensim = load_opensim()
-    model = _skeleton(opensim, equation)
-    torques = []
-    for joint in JOINTS:
-        torque = opensim.CoordinateActuator(joint)
-        torque.setName(f"{joint}_torque")
-        torque.setOptimalForce(1.0)
-        model.addForce(torque)
-        torques.append(torque)
-    _add_controller(opensim, model, torques)
-    return model
-
-
-def controls(model: Any) -> list[Any]:
-    """The ``opensim.Constant`` of each input of an arm that was built here, in their order.
-
-    To be asked for after ``initSystem``: the controller holds copies of what it was given.
-    """
-    opensim = load_opensim()
-    controller = opensim.PrescribedController.safeDownCast(model.getControllerSet().get(0))
-    functions = controller.get_ControlFunctions()
-    constant = opensim.Constant
-    return [constant.safeDownCast(functions.get(i)) for i in range(functions.getSize())]
-
-
-def _skeleton(opensim: ModuleType, equation: ArmEquation) -> Any:
+def skeleton(opensim: ModuleType, equation: ArmEquation) -> Any:
     model = opensim.Model()
     model.setGravity(opensim.Vec3(0))  # the plane is level
     parent, origin = model.getGround(), opensim.Vec3(0)
@@ -198,7 +168,7 @@ def _path(opensim: ModuleType, muscle: Muscle) -> Any:
     return path
 
 
-def _add_controller(opensim: ModuleType, model: Any, actuators: list[Any]) -> None:
+def add_controller(opensim: ModuleType, model: Any, actuators: list[Any]) -> None:
     controller = opensim.PrescribedController()
     for actuator in actuators:
         controller.addActuator(actuator)
@@ -213,16 +183,9 @@ class ArmSimulation:
     built again.
 
     Args:
-        build: Returns the ``opensim.Model`` with its inputs, as :func:`build_muscle_arm` and
-            :func:`build_torque_arm` do: a ``functools.partial`` of one of these can be pickled.
+        build: Returns the ``opensim.Model`` with its inputs, as :func:`build_muscle_arm` does: a
+            ``functools.partial`` of it can be pickled.
         accuracy: The relative accuracy of the integrator, in (0, 1).
-
-    Example:
-        >>> from functools import partial
-        >>> from paper.arm.system.torque_arm import REAL_ARM
-        >>> simulation = ArmSimulation(partial(build_torque_arm, REAL_ARM), accuracy=1e-6)
-        >>> simulation.step(np.array([0.6, 1.1, 0.0, 0.0]), np.zeros(2)).round(6)
-        array([0.6, 1.1, 0. , 0. ])
     """
 
     def __init__(self, build: Callable[[], Any], accuracy: float) -> None:
@@ -236,7 +199,7 @@ class ArmSimulation:
 
         Args:
             state: Angles and velocities, then the six activations if there are muscles.
-            inputs: Excitations of the four driven muscles, or torques of shoulder and elbow in N m.
+            inputs: Excitations of the four driven muscles.
 
         Raises:
             RuntimeError: If the integration fails, or ends in numbers that are not finite.
@@ -260,7 +223,13 @@ class ArmSimulation:
         opensim = load_opensim()
         self._model = self.build()
         self._start = self._model.initSystem()
-        self._controls = controls(self._model)
+        # Asked for after `initSystem`: the controller has copies of what it was given.
+        controller = opensim.PrescribedController.safeDownCast(
+            self._model.getControllerSet().get(0)
+        )
+        functions = controller.get_ControlFunctions()
+        inputs = range(functions.getSize())
+        self._controls = [opensim.Constant.safeDownCast(functions.get(i)) for i in inputs]
         self._vector = opensim.Vector(self._start.getNY(), 0.0)
         self._manager = opensim.Manager(self._model)
         self._manager.setWriteToStorage(False)

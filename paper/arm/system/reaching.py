@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_columns, check_switch, checked_whole
-from gpadjust.physics import ODEPhysics, Unknown
+from gpadjust.physics import ODEPhysics
 from gpadjust.states import StateSpec
 from gpadjust.systems.system import System
 from gpadjust.systems.wrappers import RememberAction
-from paper.arm.system.torque_arm import ARM_TIME_STEP, REAL_ARM, believed_arm
+from paper.arm.system.torque_arm import ARM_TIME_STEP, BELIEVED_ARM, REAL_ARM
 
 START_MEAN = (math.radians(35), math.radians(65))
 START_STD = math.radians(5)
@@ -49,25 +47,13 @@ Muscles follow their excitations with a delay, so that the next state depends on
 
 def angle_error(states: Tensor) -> Tensor:
     """The root mean square error of the angles, ``...`` in rad, of states ``... x 6`` or more."""
-    check_columns("states", states, 6, more=True)
-    error = states[..., :2] - states[..., 4:6]
-    return error.square().mean(-1).sqrt()
+    return (states[..., :2] - states[..., 4:6]).square().mean(-1).sqrt()
 
 
 def arm_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-    r"""The reward of transitions: minus the root mean square error of the angles, in rad.
+    r"""The reward of transitions, of the next states alone: minus the error of the angles, in rad.
 
     .. math:: r = -\sqrt{\big((\theta_s - \theta_s^*)^2 + (\theta_e - \theta_e^*)^2\big) / 2}
-
-    Args:
-        states: Not used.
-        actions: Not used.
-        next_states: ``... x 6`` or more, the states that were reached.
-
-    Example:
-        >>> reached = torch.tensor([0.3, 1.4, 0.0, 0.0, 0.0, 1.0])
-        >>> arm_reward(torch.zeros(6), torch.zeros(4), reached)
-        tensor(-0.3536)
     """
     return -angle_error(next_states)
 
@@ -78,7 +64,6 @@ def arm_start(n: int, spec: StateSpec = ARM_SPEC) -> Tensor:
     The angles are from :math:`\mathcal{N}((35°, 65°), (5°)^2 I)`, each angle of the targets from
     :math:`\mathcal{U}(0°, 100°)`. Previous actions of a spec that has them are zero.
     """
-    checked_whole("n", n, 0)
     angles = torch.tensor(START_MEAN, dtype=torch.float64)
     angles = angles + START_STD * torch.randn(n, 2, dtype=torch.float64)
     targets = MAX_TARGET * torch.rand(n, 2, dtype=torch.float64)
@@ -87,29 +72,18 @@ def arm_start(n: int, spec: StateSpec = ARM_SPEC) -> Tensor:
 
 
 def arm_targets() -> Tensor:
-    """The ``121 x 2`` targets, in rad, at which policies are compared: 0, 10, ..., 100° each.
-
-    Example:
-        >>> arm_targets()[[0, 1, 120]].rad2deg().round()
-        tensor([[  0.,   0.],
-                [  0.,  10.],
-                [100., 100.]], dtype=torch.float64)
-    """
+    """The ``121 x 2`` targets, in rad, at which policies are compared: 0, 10, ..., 100° each."""
     grid = torch.arange(0, 101, 10, dtype=torch.float64).deg2rad()
     return torch.cartesian_prod(grid, grid)
 
 
 def hand_position(angles: Tensor) -> Tensor:
-    """The position of the hand, ``... x 2`` in m, seen from the shoulder.
-
-    Args:
-        angles: ``... x 2``, of shoulder and elbow, in rad; at 0° both are along the first axis.
+    """The position of the hand, ``... x 2`` in m, seen from the shoulder, by its two angles in rad.
 
     Example:
         >>> hand_position(torch.tensor([0.0, torch.pi / 2], dtype=torch.float64))
         tensor([0.3090, 0.3330], dtype=torch.float64)
     """
-    check_columns("angles", angles, 2)
     upper, fore = REAL_ARM.lengths
     shoulder, both = angles[..., 0], angles[..., 0] + angles[..., 1]
     across = upper * shoulder.cos() + fore * both.cos()
@@ -117,33 +91,17 @@ def hand_position(angles: Tensor) -> Tensor:
 
 
 def hand_distance_cm(states: Tensor) -> Tensor:
-    """The distance of the hand from its place at the target angles, ``...`` in cm.
-
-    The score of episodes is the root mean square of it over steps and targets.
-
-    Args:
-        states: ``... x 6`` or more.
+    """The distance ``...`` of the hand from its place at the target angles, in cm, of states.
 
     Example:
         >>> hand_distance_cm(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi]))
         tensor(66.6000)
     """
-    check_columns("states", states, 6, more=True)
     gap = hand_position(states[..., :2]) - hand_position(states[..., 4:6])
     return 100 * gap.square().sum(-1).sqrt()
 
 
-def arm(
-    *,
-    strength: float = 0.5,
-    gains: tuple[float, float] = (8.0, 4.0),
-    memory: bool = False,
-    noise: Mapping[str, float] | None = None,
-    unknowns: bool = False,
-    substeps: int = SUBSTEPS,
-    gradient: Literal["autograd", "finite-difference"] = "autograd",
-    episode_length: int = 15,
-) -> System:
+def arm(*, strength: float = 0.5, memory: bool = False, episode_length: int = 15) -> System:
     """Reaching with an arm of six muscles; its physics has torques in their place.
 
     Its environment is :class:`MuscleArmEnv`. In the physics, which Runge-Kutta of order four
@@ -153,20 +111,9 @@ def arm(
 
     Args:
         strength: The factor on the forces of the muscles, in (0, 2].
-        gains: The torques of full actions at shoulder and elbow that the physics has, in N m. The
-            default suits strength 0.5; (5, 2.5) suits 0.3.
         memory: Whether the state has the previous action, by which the muscles' delay can be
             learnt.
-        noise: Standard deviations of the sensors' noise, by the name of the state.
-        unknowns: Whether the physics has four unknown parameters: ``forearm`` (a factor on its mass
-            and inertia), ``damping``, ``shoulder_gain``, ``elbow_gain``.
-        substeps: Integration steps, of 5 ms by default. With 8 (which err by 2e-4 rad) and
-            ``gradient="finite-difference"`` a gradient along an episode takes a tenth of the time.
-        gradient: As of :class:`~gpadjust.physics.ODEPhysics`.
         episode_length: In steps of 0.2 s.
-
-    Raises:
-        ValueError: If an option is out of range.
 
     Example:
         >>> import torch
@@ -175,33 +122,16 @@ def arm(
         >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
         tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
-    for name, switch in {"memory": memory, "unknowns": unknowns}.items():
-        check_switch(name, switch)
-    believed = believed_arm(gains)
-    named = {
-        "forearm": Unknown(1.0, factor=1.5),
-        "damping": Unknown(believed.damping, factor=2.0, unit="N m s/rad"),
-        "shoulder_gain": Unknown(max(believed.gains[0], 0.1), factor=2.0, unit="N m"),
-        "elbow_gain": Unknown(max(believed.gains[1], 0.1), factor=2.0, unit="N m"),
-    }
-    physics = ODEPhysics(
-        believed,
-        step=ARM_TIME_STEP,
-        state_dim=4,
-        substeps=substeps,
-        name="torque_arm",
-        gradient=gradient,
-        unknowns=named if unknowns else None,
-    )
     spec = ARM_MEMORY_SPEC if memory else ARM_SPEC
     return System(
         partial(_make, memory, strength=strength, max_episode_steps=episode_length),
         spec,
-        physics,
+        ODEPhysics(
+            BELIEVED_ARM, step=ARM_TIME_STEP, state_dim=4, substeps=SUBSTEPS, name="torque_arm"
+        ),
         arm_reward,
         start=partial(arm_start, spec=spec),
         episode_length=episode_length,
-        noise=noise,
     )
 
 

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-
-from gpadjust.checks import finite_array
 
 ARM_TIME_STEP = 0.2
 
@@ -43,10 +39,6 @@ class ArmEquation:
         damping: The damping :math:`d` of each joint, in N m s/rad.
         gains: The torques :math:`(g_s, g_e)` of a full action, in N m.
 
-    Raises:
-        ValueError: If one of them is not finite, a mass, length or inertia is not positive, or
-            another one is negative; or if a pair is none.
-
     Example:
         >>> equation = ArmEquation(gains=(8.0, 4.0))
         >>> rest = torch.zeros(1, 4, dtype=torch.float64)
@@ -61,91 +53,38 @@ class ArmEquation:
     damping: float = 0.5
     gains: tuple[float, float] = (0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        for entry in fields(self):
-            given, single = getattr(self, entry.name), entry.name == "damping"
-            numbers = finite_array(given, () if single else (2,))
-            if numbers is None:
-                expected = "a finite number" if single else "a pair of finite numbers"
-                raise ValueError(
-                    f"{entry.name} must be {expected}, of the two links or joints; found {given!r}."
-                )
-            positive = entry.name in ("masses", "lengths", "inertias")
-            if not (numbers > 0 if positive else numbers >= 0).all():
-                least = "positive" if positive else "not negative"
-                raise ValueError(f"{entry.name} must be finite and {least}; found {given!r}.")
-            # Hashable, also when given as a list.
-            value = float(numbers) if single else tuple(numbers.tolist())
-            object.__setattr__(self, entry.name, value)
-
-    def __call__(self, state: Tensor, action: Tensor, p: Mapping[str, Any] | None = None) -> Tensor:
-        """The time derivative of the state.
+    def __call__(self, state: Tensor, action: Tensor) -> Tensor:
+        """The time derivative ``... x 4`` of the state.
 
         Args:
             state: ``... x 4``: angles and angular velocities of shoulder and elbow, in rad and s.
             action: ``... x 4``, of which 1 asks for the full torque.
-            p: Other values, ``...``, of ``forearm`` (a factor on its mass and inertia, else 1),
-                ``damping``, ``shoulder_gain`` and ``elbow_gain``.
-
-        Returns:
-            ``... x 4``.
         """
-        if state.shape[-1] != 4 or action.shape[-1] != 4:
-            raise ValueError(
-                "Expected states ... x 4 (theta_s, theta_e, theta_s_dot, theta_e_dot) and actions "
-                f"... x 4 (a1, a2, a3, a4), got {tuple(state.shape)} and {tuple(action.shape)}."
-            )
         _, elbow, v_s, v_e = state.unbind(-1)
         a1, a2, a3, a4 = action.unbind(-1)
-        own = {"damping": self.damping, "shoulder_gain": self.gains[0], "elbow_gain": self.gains[1]}
-        given = {"forearm": 1.0, **own, **(p or {})}
-        damping, fore = given["damping"], given["forearm"]
-        m_ss, m_se, m_ee = self._mass_matrix(elbow, fore)
-        swing = self._coupling * fore * elbow.sin()
-        load_s = given["shoulder_gain"] * (a3 - a4) - damping * v_s + swing * (2 * v_s + v_e) * v_e
-        load_e = given["elbow_gain"] * (a1 - a2) - damping * v_e - swing * v_s.square()
+        coupling = self.masses[1] * self.lengths[0] * self.centres[1]
+        turn, swing = coupling * elbow.cos(), coupling * elbow.sin()
+        m_ee = self.inertias[1] + self.masses[1] * self.centres[1] ** 2
+        upper = self.inertias[0] + self.masses[0] * self.centres[0] ** 2
+        m_ss = upper + self.masses[1] * self.lengths[0] ** 2 + m_ee + 2 * turn
+        m_se = m_ee + turn
+        load_s = self.gains[0] * (a3 - a4) - self.damping * v_s + swing * (2 * v_s + v_e) * v_e
+        load_e = self.gains[1] * (a1 - a2) - self.damping * v_e - swing * v_s.square()
         determinant = m_ss * m_ee - m_se.square()
         shoulder_ddot = (m_ee * load_s - m_se * load_e) / determinant
         elbow_ddot = (m_ss * load_e - m_se * load_s) / determinant
         return torch.stack([v_s, v_e, shoulder_ddot, elbow_ddot], dim=-1)
-
-    def energy(self, state: Tensor) -> Tensor:
-        """The kinetic energy in J, ``...``, of states ``... x 4``; there is no other."""
-        _, elbow, v_s, v_e = state.unbind(-1)
-        m_ss, m_se, m_ee = self._mass_matrix(elbow)
-        return (m_ss * v_s.square() + m_ee * v_e.square()) / 2 + m_se * v_s * v_e
-
-    @property
-    def _coupling(self) -> float:
-        return self.masses[1] * self.lengths[0] * self.centres[1]
-
-    def _mass_matrix(self, elbow: Tensor, fore: Any = 1.0) -> tuple[Tensor, Tensor, Any]:
-        mass = fore * self.masses[1]
-        m_ee = fore * self.inertias[1] + mass * self.centres[1] ** 2
-        upper = self.inertias[0] + self.masses[0] * self.centres[0] ** 2
-        turn = self._coupling * fore * elbow.cos()
-        m_ss = upper + mass * self.lengths[0] ** 2 + m_ee + 2 * turn
-        return m_ss, m_ee + turn, m_ee
 
 
 REAL_ARM = ArmEquation()
 """The links of the muscle arm; segments after Nijhof and Kouwenhoven (2000). No torques."""
 
 
-def believed_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
-    """The arm as someone may believe it to be, who has no model of its muscles.
-
-    :func:`~paper.arm.system.arm` says where it errs, and what the gains are.
-
-    Example:
-        >>> believed_arm().damping
-        1.0
-    """
-    return replace(
-        REAL_ARM,
-        masses=(1.1 * REAL_ARM.masses[0], 1.1 * REAL_ARM.masses[1]),
-        inertias=(1.1 * REAL_ARM.inertias[0], 1.1 * REAL_ARM.inertias[1]),
-        damping=1.0,
-        gains=gains,
-    )
+BELIEVED_ARM = replace(
+    REAL_ARM,
+    masses=(1.1 * REAL_ARM.masses[0], 1.1 * REAL_ARM.masses[1]),
+    inertias=(1.1 * REAL_ARM.inertias[0], 1.1 * REAL_ARM.inertias[1]),
+    damping=1.0,
+    gains=(8.0, 4.0),
+)
+"""The arm as someone may believe it to be, who has no model of its muscles."""

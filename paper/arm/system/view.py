@@ -1,9 +1,9 @@
-"""Drawing the muscle arm."""
+"""Drawing the muscle arm; places are complex numbers, across and up, in m."""
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING
+from cmath import rect
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +16,30 @@ if TYPE_CHECKING:
 
 SIZE = WIDTH, HEIGHT = 480, 400
 METRE = 320.0  # pixels
-At = tuple[float, float]  # across and up, in m or pixels
-Color = tuple[int, int, int]
 SHOULDER = (0.5, 0.62)  # of width and height
+Color = tuple[int, int, int]
 
-# Where the muscles are drawn: for both ends the link (0: trunk, 1: upper arm, 2: forearm), the way
-# along it from its joint and the way to the side of flexion, in m. They are not the model's paths.
-Place = tuple[int, float, float]
-MUSCLE_LINES: tuple[tuple[Place, Place], ...] = (
-    ((0, 0.02, 0.05), (2, 0.06, 0.012)),  # biceps
-    ((0, 0.02, -0.05), (2, -0.025, -0.012)),  # triceps, long head
-    ((0, -0.02, 0.08), (1, 0.13, 0.018)),  # deltoid, anterior
-    ((0, -0.02, -0.08), (1, 0.13, -0.018)),  # deltoid, posterior
-    ((1, 0.16, 0.022), (2, 0.045, 0.012)),  # brachialis
-    ((1, 0.14, -0.022), (2, -0.025, -0.012)),  # triceps, lateral head
+# Where the muscles are drawn: for both ends the link (0: trunk, 1: upper arm, 2: forearm), and the
+# place along it from its joint and to the side of flexion, in m. They are not the model's paths.
+MUSCLE_LINES = (
+    ((0, 0.02 + 0.05j), (2, 0.06 + 0.012j)),  # biceps
+    ((0, 0.02 - 0.05j), (2, -0.025 - 0.012j)),  # triceps, long head
+    ((0, -0.02 + 0.08j), (1, 0.13 + 0.018j)),  # deltoid, anterior
+    ((0, -0.02 - 0.08j), (1, 0.13 - 0.018j)),  # deltoid, posterior
+    ((1, 0.16 + 0.022j), (2, 0.045 + 0.012j)),  # brachialis
+    ((1, 0.14 - 0.022j), (2, -0.025 - 0.012j)),  # triceps, lateral head
 )
+
+
+class Link(NamedTuple):
+    """Where the joint of a link is, and its direction."""
+
+    joint: complex
+    direction: complex
+
+    def place(self, along: complex) -> complex:
+        """A place along the link, and to its side."""
+        return self.joint + along * self.direction
 
 
 def draw_arm(
@@ -44,43 +53,41 @@ def draw_arm(
         activations: Of the six muscles, in [0, 1].
     """
     canvas.fill(WHITE)
-    _line(canvas, (0.0, -0.12), (0.0, 0.12), GREY, 0.012)
-    target = _poses(*state[4:])
-    _arm(canvas, target, LIGHT)
-    _circle(canvas, _place(target, (2, REAL_ARM.lengths[1], 0.0)), GREEN, 0.03, ring=True)
-    links = _poses(*state[:2])
-    _arm(canvas, links, GREY)
+    _line(canvas, -0.12j, 0.12j, GREY, 0.012)
+    _circle(canvas, _arm(canvas, state[4:], LIGHT)[3].joint, GREEN, 0.03, ring=True)
+    links = _arm(canvas, state[:2], GREY)
     for ends, activation in zip(MUSCLE_LINES, activations.clip(0, 1), strict=True):
-        start, end = (_place(links, place) for place in ends)
-        _line(canvas, start, end, _mixed(float(activation)), 0.008 + 0.012 * float(activation))
-    _circle(canvas, _place(links, (2, REAL_ARM.lengths[1], 0.0)), GREEN, 0.016)
+        start, end = (links[link].place(along) for link, along in ends)
+        red, green, blue = (
+            round(b + float(activation) * (r - b)) for b, r in zip(BLUE, RED, strict=True)
+        )
+        _line(canvas, start, end, (red, green, blue), 0.008 + 0.012 * float(activation))
+    _circle(canvas, links[3].joint, GREEN, 0.016)
 
 
-def _arm(canvas: pygame.Surface, links: list[LinkPose], color: Color) -> None:
-    for link, length in zip((1, 2), REAL_ARM.lengths, strict=True):
-        start, end = _place(links, (link, 0.0, 0.0)), _place(links, (link, length, 0.0))
+def _arm(canvas: pygame.Surface, angles: NDArray[np.float64], color: Color) -> list[Link]:
+    """Draw the links; return the trunk, these and the hand."""
+    shoulder, elbow = angles.tolist()
+    links = [Link(0j, 1), Link(0j, rect(1, shoulder))]
+    for length, angle in zip(REAL_ARM.lengths, (shoulder + elbow, 0.0), strict=True):
+        start, end = links[-1].joint, links[-1].place(length)
         _line(canvas, start, end, color, 0.02)
         _circle(canvas, start, color, 0.018)
+        links.append(Link(end, rect(1, angle)))
+    return links
 
 
-def _line(canvas: pygame.Surface, start: At, end: At, color: Color, width: float) -> None:
+def _line(canvas: pygame.Surface, start: complex, end: complex, color: Color, width: float) -> None:
     import pygame
 
     # As a polygon: pygame's thick lines have slanted ends.
-    (x, y), (x_end, y_end) = start, end
-    length = math.hypot(x_end - x, y_end - y)
-    across, up = (y - y_end) * width / 2 / length, (x_end - x) * width / 2 / length
-    corners = [
-        (x + across, y + up),
-        (x_end + across, y_end + up),
-        (x_end - across, y_end - up),
-        (x - across, y - up),
-    ]
+    side = 1j * (end - start) / abs(end - start) * width / 2
+    corners = (start + side, end + side, end - side, start - side)
     pygame.draw.polygon(canvas, color, [_pixel(corner) for corner in corners])
 
 
 def _circle(
-    canvas: pygame.Surface, center: At, color: Color, radius: float, ring: bool = False
+    canvas: pygame.Surface, center: complex, color: Color, radius: float, ring: bool = False
 ) -> None:
     import pygame
 
@@ -88,27 +95,6 @@ def _circle(
     pygame.draw.circle(canvas, color, _pixel(center), radius * SMOOTH * METRE, width)
 
 
-LinkPose = tuple[float, float, float]  # where the link's joint is, in m, and its direction
-
-
-def _poses(shoulder: float, elbow: float) -> list[LinkPose]:
-    length = REAL_ARM.lengths[0]
-    elbow_at = (length * math.cos(shoulder), length * math.sin(shoulder))
-    return [(0.0, 0.0, 0.0), (0.0, 0.0, shoulder), (*elbow_at, shoulder + elbow)]
-
-
-def _place(links: list[LinkPose], place: Place) -> At:
-    link, along, aside = place
-    x, y, direction = links[link]
-    cos, sin = math.cos(direction), math.sin(direction)
-    return x + along * cos - aside * sin, y + along * sin + aside * cos
-
-
-def _pixel(place: At) -> At:
-    x = SHOULDER[0] * WIDTH + METRE * place[0]
-    return SMOOTH * x, SMOOTH * (SHOULDER[1] * HEIGHT - METRE * place[1])
-
-
-def _mixed(share: float) -> Color:
-    red, green, blue = (round(b + share * (r - b)) for b, r in zip(BLUE, RED, strict=True))
-    return red, green, blue
+def _pixel(place: complex) -> tuple[float, float]:
+    x, y = SHOULDER[0] * WIDTH + METRE * place.real, SHOULDER[1] * HEIGHT - METRE * place.imag
+    return SMOOTH * x, SMOOTH * y

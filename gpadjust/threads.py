@@ -23,11 +23,6 @@ def threads_for(num_points: int) -> Iterator[None]:
 
     Threads that wait for each other at every small product are slower than one. PyTorch is limited
     in the calling thread alone, NumPy's and SciPy's libraries in the process, by the first thread.
-
-    Example:
-        >>> with threads_for(12):
-        ...     torch.get_num_threads()
-        1
     """
     with ExitStack() as stack:
         if num_points <= _SMALL:
