@@ -23,6 +23,7 @@ CHAPTERS = {
     "kinds": ("Kinds",),
     "control": ("Known", "First"),
     "misled": ("Misled",),
+    "simulators": ("Simulators",),
 }
 """Folders, and the classes of the experiments that they declare."""
 EXPERIMENTS = {
