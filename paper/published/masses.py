@@ -10,8 +10,10 @@ Tasks: ten folds by a permutation of the nuclides with ``split``; and of each ch
 more than 2k the k lightest and the k heaviest, all left out at once, k = 2 and 4.
 
 Tried before the first run, on the first of the ten folds of the seed 1000 alone: RBF and Matern
-kernels, inputs without parity and without the fifth, CKA and a physics mean, and how many rows and
-iterations a fit needs. The ends of chains were looked at in no way.
+kernels, inputs without parity and without the fifth, CKA and a physics mean. There, too, after a
+first run whose intervals held 0.76: how many steps by all rows follow the search by 600 rows. With
+none the intervals of a CKA hold 0.81, with 5 steps 0.89, with 15 steps 0.95. The ends of chains were
+looked at in no way.
 """
 
 from __future__ import annotations
@@ -24,10 +26,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
 
 from gpadjust import CalibratedPhysics, Unknown, fit
-from gpadjust.core import MATERN52, Stationary
+from gpadjust.core import GP, MATERN52, Stationary
 from gpadjust.core.kernels import RHO
 from gpadjust.physics import FunctionPhysics, ParameterValues
 from paper.common.experiment import Run, Table
@@ -37,6 +40,7 @@ from paper.common.verdicts import scores_of
 from paper.published import Masses, published
 
 DATA = Path(__file__).parent / "data" / "masses" / "ame2020.csv"
+STEPS = 15  # of L-BFGS by all rows, after the search by some
 MAGIC = (8, 20, 28, 50, 82, 126, 184)
 _INPUTS = ["Z", "N", "odd Z", "odd N", "near N = Z"]
 
@@ -103,6 +107,21 @@ def build(model: str, data: Sequence[Tensor], physics: FunctionPhysics) -> Any:
     return LEARNERS[name].make(*data[:2], train_Yvar=data[2], physics=physics, **kernels)
 
 
+def climb(model: GP, steps: int) -> None:
+    """Go on to the most likely hyper-parameters from those of a model, by steps of L-BFGS."""
+    shape = model.draws.shape
+
+    def loss(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        u = torch.from_numpy(flat).reshape(shape)
+        value, gradient = model.log_likelihood(u, choice=0)
+        # -log p(y | u) - log N(u | 0, I)
+        return float(0.5 * u.square().sum() - value.sum()), (u - gradient).flatten().numpy()
+
+    begin = model.draws.flatten().numpy().copy()
+    end = minimize(loss, begin, jac=True, method="L-BFGS-B", options={"maxiter": steps})
+    model.set_draws(torch.from_numpy(end.x).reshape(shape))
+
+
 def run(experiment: Masses, task: str, physics: str, model: str, seed: int) -> Run:
     """Fit one model to the nuclides that a task does not leave out, and predict the others."""
     table = nuclides(experiment.stride)
@@ -120,11 +139,12 @@ def run(experiment: Masses, task: str, physics: str, model: str, seed: int) -> R
         made: Any = CalibratedPhysics(X[rows], Y[rows], physics=law)
         fit(made, "map", seed=seed)
     else:
-        # A model of all rows, whose hyper-parameters are those of some of them.
+        # Hyper-parameters are searched by some rows, and from there by all.
         made = build(model, (X, Y, V), law)
         some = made.subset_rows(torch.from_numpy(rows))
         fit(some, "map", seed=seed)
         made.set_draws(some.draws)
+        climb(made, STEPS)
     test_X, test_Y, test_V = _tensors(test)
     held = half = None
     with torch.no_grad():
