@@ -12,8 +12,8 @@ more than 2k the k lightest and the k heaviest, all left out at once, k = 2 and 
 Tried before the first run, on the first of the ten folds of the seed 1000 alone: RBF and Matern
 kernels, inputs without parity and without the fifth, CKA and a physics mean. There, too, after a
 first run whose intervals held 0.76: how many steps by all rows follow the search by 600 rows. With
-none the intervals of a CKA hold 0.81, with 5 steps 0.89, with 15 steps 0.95. The ends of chains were
-looked at in no way.
+none the intervals of a CKA hold 0.81, with 5 steps 0.89, with 15 steps 0.95. The ends of chains
+were looked at in no way.
 """
 
 from __future__ import annotations
