@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import signal
 import threading
 import time
 from _thread import interrupt_main
@@ -292,6 +293,15 @@ def test_a_model_that_the_caller_changes_later_is_a_copy():
         same([physics(X), physics(X, changed)], [Y, WITH_ONE(X, changed)])
 
 
+@pytest.fixture
+def with_interrupts():
+    """Let Ctrl-C interrupt tests that a shell runs in the background, too."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("with_interrupts")
 def test_an_interrupt_ends_a_long_call():
     ours, X = MujocoPhysics(arm(), step=1.0), rows(20_000, 7)  # minutes
     threading.Timer(0.3, interrupt_main).start()
