@@ -32,6 +32,7 @@ _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn fr
 _OF_NUTS = 640  # draws, a multiple of 16
 _BEFORE_NUTS = 512  # draws of the default fit, around which chains jump
 _SEARCHES = 4  # for the mode
+_BEFORE_SEARCH, _FIRST_OF_SEARCH = 64, 32  # draws of a point fit, and how many begin for each
 _STEPS, _STEPS_OF_SHARED = 2_000, 200  # the latter with a fit by least squares, and begun again
 _NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
 _LESS_LIKELY = 5.0  # difference of log density from the best mode beyond which a mode is ignored
@@ -177,8 +178,16 @@ def fit(
 
 
 def _most_likely(model: GP, num_draws: int | None, seed: int) -> FitResult:
-    """Set the most likely coordinates of the whole model; a number of draws has no effect."""
-    mode = modes(model, 0, seed, is_precise=True)[:1]
+    """Set the most likely coordinates of the whole model; a number of draws has no effect.
+
+    A mode of few observations may be so narrow that only a search from draws around it finds it.
+    """
+    others = None
+    if model.targets().shape[-1] <= _SMALL and not model.table.shared:
+        density, like = partial(model.log_likelihood, choice=0), model.u.detach()[0]
+        draws = sample(density, like, _BEFORE_SEARCH, seed, first=_FIRST_OF_SEARCH)
+        others = _sorted(model, 0, draws.u)[: _SEARCHES // 2]
+    mode = modes(model, 0, seed, is_precise=True, others=others)[:1]
     if model.table.shared:
         start, _ = around_mode(partial(model.log_likelihood, choice=0), mode[0], True)
         mode = model.table.with_choice(start.mean.unsqueeze(0), 0)
@@ -342,17 +351,23 @@ def _parts(model: GP, seed: int) -> list[GP]:
     return [*filter(None, parts), model]
 
 
-def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor:
+def modes(
+    model: GP, choice: int, seed: int, is_precise: bool = False, others: Tensor | None = None
+) -> Tensor:
     """Return the most likely end of some searches, or two that are nearly as likely, ``2 x B x P``.
 
-    Searches begin with the most likely of some draws from the prior, and the medians of the priors.
+    Searches begin with the most likely of some draws from the prior, and the medians of the priors;
+    some of them with others, ``N x B x P``, if these are given.
     """
     like = model.u.detach()[0]
     number = max(16, 6400 // max(len(model.data.Y), 25))
     generator = torch.Generator().manual_seed(seed)
     u = standard_normal((number, *like.shape), generator, like)
     searches = _SEARCHES // 2 if choice else _SEARCHES
-    begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
+    if others is None:
+        others = u[:0]
+    likely = _sorted(model, choice, u)[: searches - 1 - len(others)]
+    begins = torch.cat([others, likely, torch.zeros_like(u[:1])])
     if model.table.shared:
         begins[-2] = _with_least_squares(model, choice, u)
     most = _STEPS_OF_SHARED if is_precise and model.table.shared else _STEPS

@@ -11,6 +11,7 @@ from gpadjust.core import CKA, GP, Choice, LogNormal, SamplingWarning, Term, Zer
 from gpadjust.core.sample import around_mode
 from gpadjust.kinds import LinkedCKA, NoisyInputs, RelativeNoise
 from gpadjust.physics import FunctionPhysics, Unknown
+from tests import systems
 from tests.systems import wave
 
 
@@ -51,6 +52,22 @@ def test_evidence_and_draws(n):
     values, _ = model.log_likelihood(grid[:, None, None])
     best = grid[(values.flatten() - 0.5 * grid.square()).argmax()]
     assert model.u.item() == pytest.approx(best.item(), abs=0.02)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 4])
+def test_a_point_fit_finds_a_narrow_mode(seed):
+    """The truth is 8 f_p - 20 x without noise: few starts lead to it, as far as they are."""
+
+    def truth(X):
+        return (6 * X - 2).square() * (12 * X - 4).sin() / 4
+
+    X = systems.uniform(8, 1, low=-0.6, seed=seed)
+    model = CKA(X, truth(X), physics=lambda X: truth(X) / 8 + 2.5 * X, center=0.0, constants=False)
+    fit(model, "map")
+    line = systems.line(40, -0.6)
+    with torch.no_grad():
+        error = (model.posterior(line).mean - truth(line)).square().mean().sqrt()
+    assert error < 0.01
 
 
 @pytest.mark.parametrize("n", [8, 60])
