@@ -54,10 +54,6 @@ class Known(Experiment):
     )
     cheap: ClassVar[Mapping[str, Any]] = {"trials": 1}
 
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """All; two of ensembles, which are slow."""
-        return self.seeds[:2] if kind[1] == "ensemble" else self.seeds
-
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings, and how far plans look."""
         return {**self.settings, "horizon": HORIZONS[kind[0]]}
