@@ -6,16 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from botorch.test_functions import Branin
 from gymnasium.utils.env_checker import check_env
 from torch.testing import assert_close
 
-from gpadjust.dynamics import PhysicsDynamics, Trajectories
+from gpadjust.dynamics import PhysicsDynamics
 from paper.control.systems import MACHINES as KNOWN
-from paper.forrester.problem import forrester
 from paper.functions import PROBLEMS as GROUPS
 from paper.functions.functions import data_of
-from paper.functions.problems import PROBLEMS, _branin
+from paper.functions.problems import PROBLEMS
 from paper.machines.networks import NetworkDynamics
 from paper.machines.pendulums import DOUBLE_PENDULUM, PENDULUM
 from paper.machines.records import REAL, folder_of
@@ -58,13 +56,6 @@ def test_pairs_have_the_values_of_another_package(name, x, high, low):
     X = torch.from_numpy((np.array([x]) - start) / size)
     assert PROBLEMS[name].truth(X).item() == pytest.approx(high, rel=1e-9)
     assert PROBLEMS[name].physics(X).item() == pytest.approx(low, rel=1e-9)
-
-
-def test_classical_functions_are_those_of_others():
-    X = PROBLEMS["branin"].points(50, 0) * torch.tensor([15.0, 15.0]) - torch.tensor([5.0, 0.0])
-    assert_close(_branin(*X.T), Branin(dtype=X.dtype)(X), rtol=1e-6, atol=1e-6)
-    x = PROBLEMS["forrester"].points(9, 0)
-    assert_close(PROBLEMS["forrester"].truth(x), forrester(x))
 
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -206,18 +197,6 @@ def test_friction_takes_what_the_drives_do_not_give(machine):
 
     assert_close(power(without), torch.zeros(20).double(), rtol=0, atol=1e-9)
     assert (power(known) < 0).all()
-
-
-@pytest.mark.slow
-def test_least_squares_finds_the_parameters():
-    machine, generator = DOUBLE_PENDULUM, torch.Generator().manual_seed(0)
-    states = torch.randn(60, 4, generator=generator).double()
-    actions = torch.randn(60, 2, generator=generator).double()
-    following = PhysicsDynamics(machine.spec, machine.physics("identified")).sample(states, actions)
-    noise = 1e-3 * torch.randn(following.shape, generator=generator).double()
-    fitted = PhysicsDynamics(machine.spec, machine.physics())
-    fitted.update(*Trajectories(states, actions, following + noise))
-    assert_close(fitted.predict(states, actions).mean, following, rtol=0, atol=2e-3)
 
 
 def test_networks_learn_and_stop_early():

@@ -39,10 +39,3 @@ def test_values_and_intervals_are_the_certified_ones(name, start):
     assert (widths > 1 / WIDE).all()
     # Six rows and two parameters: a t distribution of four degrees of freedom is 1.4 times as wide.
     assert (widths < (1.4 * WIDE if name == "BoxBOD" else WIDE)).all()
-
-
-@pytest.mark.slow
-def test_tables(ran):
-    runs, tables = ran("nist", "--only", "DanWood")
-    assert len(runs) == 4
-    assert "| within both limits | 1 |" in tables
