@@ -146,13 +146,3 @@ def test_dynamics(name):
 def test_an_option_that_models_do_not_have(data):
     with pytest.raises(TypeError, match="Unknown option 'likelihood'"):
         compare(*data, f_p, likelihood=0.1)
-
-
-def test_variances_of_rows_go_with_the_rows(data):
-    X, y = data[0].numpy(), data[1].numpy()[:, 0]
-    variances = np.linspace(0.01, 0.1, len(y))
-    regressor = CKARegressor(fit_method="map", random_state=0)
-    fitted = regressor.fit(X[:8], y[:8], train_Yvar=variances[:8])
-    assert np.allclose(fitted.model_.data.Yvar[:, 0], variances[:8])
-    search = GridSearchCV(regressor, {"random_state": [0]}, cv=2, error_score="raise")
-    assert np.isfinite(search.fit(X, y, train_Yvar=variances).best_score_)

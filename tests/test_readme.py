@@ -69,11 +69,7 @@ def test_the_first_command_writes_the_page_of_the_readme(tmp_path, monkeypatch, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "page",
-    [*FIRST, *(pytest.param(page, marks=pytest.mark.slow) for page in GUIDE)],
-    ids=lambda page: page.stem,
-)
+@pytest.mark.parametrize("page", [*FIRST, *GUIDE], ids=lambda page: page.stem)
 def test_each_page_runs_by_itself(page, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     if page.stem == "fmus":
