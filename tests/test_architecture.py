@@ -61,8 +61,8 @@ REPORT, WITH_A_REPORT = 14, 29  # of report and validation, and of what is below
 IDENTIFIED = 31  # that a log passes on the way to its page
 
 
-def passed(call):
-    """The files, classes and functions of the library whose code a call runs.
+def passed(call, root=ROOT):
+    """The files, classes and functions of a folder, the library's, whose code a call runs.
 
     Comprehensions are no functions: since Python 3.12 they are not called.
     """
@@ -70,9 +70,9 @@ def passed(call):
 
     def record(frame, event, argument):
         path = frame.f_code.co_filename
-        if event == "call" and path.startswith(str(ROOT)):
+        if event == "call" and path.startswith(str(root)):
             name = frame.f_code.co_qualname
-            files.add(Path(path).relative_to(ROOT).as_posix())
+            files.add(Path(path).relative_to(root).as_posix())
             outer, dot, inner = name.partition(".")
             if dot and not inner.startswith("<locals>"):
                 classes.add(outer)

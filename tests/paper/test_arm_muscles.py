@@ -56,7 +56,7 @@ def test_golden_trajectory():
     env = start(MuscleArmEnv(strength=0.3, accuracy=1e-8))
     states = []
     for _ in range(5):
-        env.step(np.array([0.2, 0.1, 0.3, 0.1]))
+        env.step(GENTLE)
         states.append(env.state[:4])
     first, fifth = [0.6745856, 1.1299697, 0.613568, -0.0042265], [1.4363824, 1.1695989, 0.8287791]
     np.testing.assert_allclose(states[0], first, rtol=0, atol=1e-5)
@@ -138,18 +138,15 @@ def test_options_do_not_change_what_else_is_drawn(arm):
     assert np.array_equal(arm.reset(seed=5, options={"target": TARGET})[0][:4], drawn[:4])
 
 
-@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
-def test_copy_goes_on_as_the_original(render_mode):
-    env = gym.make(ID, render_mode=render_mode)
+def test_copy_goes_on_as_the_original():
+    env = gym.make(ID, render_mode="rgb_array")
     env.reset(seed=0)
     rollout(env, 3)
-    if render_mode:
-        env.render()
+    env.render()
     twin = pickle.loads(pickle.dumps(env))
     assert same(rollout(env, 3), rollout(twin, 3))
     assert np.array_equal(env.reset()[0], twin.reset()[0])
-    if render_mode == "rgb_array":
-        assert np.array_equal(env.render(), twin.render())
+    assert np.array_equal(env.render(), twin.render())
     env.close()
     twin.close()
 
@@ -201,7 +198,7 @@ def test_failed_integration_truncates_and_reset_recovers(arm, speed):
 def test_random_trials_do_not_fail(arm):
     arm.reset(seed=0)
     rng = np.random.default_rng(0)
-    for trial in range(200):
+    for trial in range(24):
         arm.reset()
         for _ in range(15):
             # Every second trial switches the muscles fully on and off.

@@ -19,7 +19,7 @@ from paper.arm.system.opensim import (
     skeleton,
 )
 from paper.arm.system.reaching import ARM_SPEC, arm_reward, arm_start, arm_targets
-from paper.arm.system.torque_arm import BELIEVED_ARM, REAL_ARM
+from paper.arm.system.torque_arm import BELIEVED_ARM
 
 OTHER_ARM = ArmEquation((1.3, 2.1), (0.4, 0.2), (0.1, 0.12), (0.03, 0.01), 0.2, (3.0, 5.0))
 
@@ -76,14 +76,6 @@ def test_equation_is_that_of_the_lagrangian(mechanics, states_and_actions, equat
     unbalanced = mechanics(states.unbind(-1), rates[..., 2:].unbind(-1), loads, links)
     assert torch.equal(rates[..., :2], states[..., 2:])
     torch.testing.assert_close(torch.stack(unbalanced), torch.zeros(2, 5, 10).double())
-
-
-def test_torque_arm_is_a_tenth_too_heavy():
-    np.testing.assert_allclose(BELIEVED_ARM.masses, (1.1 * 1.82, 1.1 * 1.43))
-    np.testing.assert_allclose(BELIEVED_ARM.inertias, (1.1 * 0.018, 1.1 * 0.018))
-    assert BELIEVED_ARM.lengths == REAL_ARM.lengths
-    assert BELIEVED_ARM.gains == (8.0, 4.0)
-    assert BELIEVED_ARM.damping == 2 * REAL_ARM.damping
 
 
 def torque_arm():

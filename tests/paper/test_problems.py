@@ -31,28 +31,19 @@ from paper.published.uci_tables import DATA as UCI
 from paper.published.uci_tables import physics as formula
 from paper.published.uci_tables import split
 
-BOUNDS = {
-    "bohachevsky": (-5, 10),
-    "booth": (-10, 20),
-    "branin": ([-5, 0], [15, 15]),
-    "currin": (0, 1),
-    "forrester": (0, 1),
-}
 
-
-# By the package mf2, version 2022.6.0: name, inputs, high, low.
+# By the package mf2, version 2022.6.0: name, bounds of inputs, inputs, high, low.
 @pytest.mark.parametrize(
-    ("name", "x", "high", "low"),
+    ("name", "start", "size", "x", "high", "low"),
     [
-        ("bohachevsky", [-3.7, -1.9], 21.7717101571, 9.30945988136),
-        ("booth", [-7.4, -3.8], 1040.96, 572.636),
-        ("branin", [-3.05, 4.65], -49.3385511481, 19.3951038769),
-        ("currin", [0.13, 0.31], 10.1252792148, 9.56727815299),
-        ("forrester", [0.13], -0.960665451521, -9.18033272576),
+        ("bohachevsky", -5, 10, [-3.7, -1.9], 21.7717101571, 9.30945988136),
+        ("booth", -10, 20, [-7.4, -3.8], 1040.96, 572.636),
+        ("branin", [-5, 0], 15, [-3.05, 4.65], -49.3385511481, 19.3951038769),
+        ("currin", 0, 1, [0.13, 0.31], 10.1252792148, 9.56727815299),
+        ("forrester", 0, 1, [0.13], -0.960665451521, -9.18033272576),
     ],
 )
-def test_pairs_have_the_values_of_another_package(name, x, high, low):
-    start, size = (np.asarray(end, float) for end in BOUNDS[name])
+def test_pairs_have_the_values_of_another_package(name, start, size, x, high, low):
     X = torch.from_numpy((np.array([x]) - start) / size)
     assert PROBLEMS[name].truth(X).item() == pytest.approx(high, rel=1e-9)
     assert PROBLEMS[name].physics(X).item() == pytest.approx(low, rel=1e-9)

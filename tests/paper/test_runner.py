@@ -208,23 +208,6 @@ def test_a_full_disk_loses_only_what_is_being_written(tmp_path, monkeypatch):
     assert file.path.read_bytes() == before
 
 
-@pytest.mark.slow
-def test_a_killed_process_leaves_whole_runs(tmp_path):
-    code = (
-        "import os, sys\nfrom pathlib import Path\n"
-        "from paper.common.runs import RunsFile\n"
-        "file = RunsFile(Path(sys.argv[1]), ('seed',))\n"
-        "for seed in range(200):\n    file.append({'seed': seed, 'x': [0.5] * 1000})\n"
-        "    if seed == 20:\n        os.kill(os.getpid(), 9)\n"
-    )
-    path = tmp_path / "runs.jsonl"
-    made = subprocess.run([sys.executable, "-c", code, str(path)], cwd=ROOT, check=False)
-    assert made.returncode == -9
-    assert len(RunsFile(path, ("seed",)).read()) == 21
-    RunsFile(path, ("seed",)).append({"seed": 21})  # the lock went with the process
-    assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == [*range(22)]
-
-
 def test_how_runs_were_made_is_written_once(tmp_path):
     """In files that name it by a text, too, as until November 2026."""
     file = RunsFile(tmp_path / "runs.jsonl", ("seed",))
