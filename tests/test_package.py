@@ -53,11 +53,11 @@ def test_what_is_not_needed_is_not_imported():
     """One after the other, so that none may bring what a later one is to do without."""
     steps = {
         "import gpadjust": "torch",
-        "import gpadjust.active": "gymnasium stable_baselines3 pygame matplotlib pandas sklearn",
         "import gpadjust.states, gpadjust.files": "botorch gpytorch linear_operator gymnasium",
         "from gpadjust import ODEPhysics": "botorch gpytorch gymnasium",
         "import gpadjust.systems": "botorch gpytorch linear_operator stable_baselines3",
         "from gpadjust import CKA, compare, fit": "scipy.stats scipy.integrate joblib",
+        "import gpadjust.active": "stable_baselines3 pygame matplotlib pandas sklearn",
     }
     code = "import sys\n" + "".join(
         f"{first}\nprint({first!r}, *set({absent.split()}) & {{*sys.modules}})\n"
