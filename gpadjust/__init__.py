@@ -129,17 +129,7 @@ __all__ = [
 # Rooms that need no extra, in the order in which a name of `__all__` is looked for.
 _ROOMS = ("physics", "core", "kinds", "many", "validation", "states", "active", "dynamics")
 # Rooms that are not searched for names; most need an extra.
-_OTHER_ROOMS = (
-    "ax",
-    "control",
-    "export",
-    "files",
-    "records",
-    "report",
-    "rl",
-    "sklearn",
-    "systems",
-)
+_OTHER_ROOMS = ("ax", "control", "export", "files", "records", "report", "rl", "sklearn", "systems")
 
 
 def __getattr__(name: str) -> Any:

@@ -1,15 +1,13 @@
-"""Settings, data and the models under test, shared by all tests."""
+"""Settings and data, shared by all tests."""
 
 import sys
-from collections import defaultdict
-from itertools import combinations
 
 import pytest
 import torch
 from hypothesis import settings
 
 from tests import systems
-from tests.systems import truth
+from tests.systems import slopes, truth
 
 torch.set_num_threads(1)
 settings.register_profile("unhurried", deadline=None)  # a busy machine is no failure
@@ -29,54 +27,6 @@ def pytest_ignore_collect(collection_path, config):
     if collection_path.name == "benchmarks" and not config.getoption("benchmark_only"):
         return True
     return None
-
-
-_LEFT = pytest.StashKey[list]()
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config, items):
-    """Of tests with three parameters or more, leave to the slow run what has no new pair."""
-    cases, left = defaultdict(list), config.stash.setdefault(_LEFT, [])
-    for item in items:
-        if len(getattr(getattr(item, "callspec", None), "params", ())) > 2:
-            cases[item.nodeid.partition("[")[0]].append(item)
-    for several in cases.values():
-        quick = [item for item in several if item.get_closest_marker("slow") is None]
-        values = {item: [(n, id(v)) for n, v in item.callspec.params.items()] for item in quick}
-        rest = {item: {*combinations(pairs, 2)} for item, pairs in values.items()}
-        while any(rest.values()):
-            best = max(rest, key=lambda item: len(rest[item]))  # the first of them
-            found = rest.pop(best)
-            rest = {item: pairs - found for item, pairs in rest.items()}
-        for item in rest:
-            item.add_marker("slow")
-            left.append(item.nodeid)
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_sessionfinish(session):
-    """Tell the process that reports (of pytest-xdist) which cases were left to the slow run."""
-    if hasattr(session.config, "workeroutput"):
-        session.config.workeroutput["left"] = session.config.stash[_LEFT]
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node):
-    if hasattr(node, "workeroutput"):
-        node.config.stash[_LEFT] = node.workeroutput["left"]
-
-
-def pytest_terminal_summary(terminalreporter, config):
-    """Say how many cases were left to the slow run, and with `-v` which."""
-    if (left := config.stash.get(_LEFT, [])) and config.option.markexpr == "not slow":
-        terminalreporter.section("left to -m slow")
-        terminalreporter.write_line(
-            f"{len(left)} cases of tests with three parameters or more: each pair of their values "
-            "occurs in a case that ran (-v names them)"
-        )
-        for nodeid in left if config.option.verbose > 0 else ():
-            terminalreporter.write_line(nodeid)
 
 
 @pytest.fixture(autouse=True)
@@ -146,18 +96,14 @@ def close():
 
 @pytest.fixture
 def gradient_is_right():
-    """Asserts the gradient of a function of few numbers, by central differences."""
+    """Asserts the gradient of a function of few numbers, by differences."""
 
     def gradient_is_right(function, X):
         leaf = X.clone().requires_grad_()
         (gradient,) = torch.autograd.grad(function(leaf).sum(), leaf)
-        steps = 1e-5 * torch.eye(X.numel(), dtype=torch.float64)
         with torch.no_grad():
-            changes = [
-                (function(X + h) - function(X - h)).item() / 2e-5
-                for h in (step.reshape(X.shape) for step in steps)
-            ]
-        expected = torch.tensor(changes, dtype=torch.float64).reshape(X.shape)
+            flat = slopes(lambda x: function(x.reshape(X.shape)).sum(), X.flatten(), 1e-5)
+        expected = flat.reshape(X.shape)
         size = expected.abs().max().item()
         assert size > 0
         torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-4 * size)

@@ -37,12 +37,7 @@ def test_right_values_pass():
         number = checks.checked_whole("n", value, 3)
         assert (number, type(number)) == (3, int)
     assert checks.checked_whole("n", -5) == -5
-    checks.check_level(0.95)
-    checks.check_switch("on", False)
-    checks.check_choice("way", "in", ("in", "out"))
-    checks.check_columns("s", ONES, 3)
     checks.check_columns("s", torch.ones(2, 4), 3, more=True)
-    checks.check_finite("X", ONES)
     checks.check_observed("Y", torch.tensor([[1.0, NAN]]))
     assert checks.checked_options("options", None, ("a",)) == {}
     assert checks.checked_options("options", {"a": 1}, ("a",)) == {"a": 1}

@@ -8,16 +8,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-SLOW = {"nuclides", "pendulum", "reactor", "yacht"}
 GALLERY = (ROOT / "docs" / "gallery.md").read_text()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "example",
-    [pytest.param(e, marks=pytest.mark.slow if e.stem in SLOW else ()) for e in EXAMPLES],
-    ids=lambda example: example.stem,
-)
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.stem)
 def test_an_example_runs_and_prints_what_the_gallery_shows(example, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")

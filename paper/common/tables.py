@@ -120,11 +120,9 @@ def mean_error(
     return cell
 
 
-def ratio_of(
-    value: str, name: str, other: str, on: Sequence[str] = ("seed",), by: str = "learner"
-) -> Cell:
-    """A cell with the geometric mean of ratios of two learners and its 95 % interval, paired."""
-    return lambda runs: paired(runs, value, by, name, other, on, ratio=True).ratio()
+def ratio_of(value: str, name: str, other: str) -> Cell:
+    """A cell with the geometric mean of ratios of two learners and its 95 % interval, by seeds."""
+    return lambda runs: paired(runs, value, "learner", name, other, ratio=True).ratio()
 
 
 def across(runs: pd.DataFrame, by: str, labels: Mapping[Any, str], cell: Cell) -> dict[str, Cell]:

@@ -143,15 +143,11 @@ def _booth(x: Tensor, y: Tensor) -> Tensor:
     return (x + 2 * y - 7) ** 2 + (2 * x + y - 5) ** 2
 
 
-def _in_bounds(function: Callable[..., Tensor], low: float, high: float, low_2: float = 0.0,
-               high_2: float = 0.0) -> Callable[..., Tensor]:  # fmt: skip
-    """A function of inputs in their bounds, as one of the unit cube."""
-
-    def of_unit(a: Tensor, *rest: Tensor) -> Tensor:
-        second = [low_2 + (high_2 - low_2) * b for b in rest]
-        return function(low + (high - low) * a, *second)
-
-    return of_unit
+def _in_bounds(
+    function: Callable[..., Tensor], low: float, high: float, low_2: float, high_2: float
+) -> Callable[..., Tensor]:
+    """A function of two inputs in their bounds, as one of the unit square."""
+    return lambda a, b: function(low + (high - low) * a, low_2 + (high_2 - low_2) * b)
 
 
 def _branin_high(x: Tensor, y: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Networks as dynamics, alone or beside f_p."""
+"""Networks as dynamics, beside f_p."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Networks(nn.Module):
 
 
 class NetworkDynamics(Dynamics):
-    """Networks that predict the change of the state, or what f_p lacks of it.
+    """Networks that predict what f_p lacks of the change of the state.
 
     They are trained from new weights at each update, full batch, by Adam with weight decay. Each
     learns from all transitions but its fold, and keeps the weights with which it was best there;
@@ -49,7 +49,7 @@ class NetworkDynamics(Dynamics):
 
     Args:
         spec: What the entries of states are.
-        physics: f_p; None for networks alone.
+        physics: f_p.
         number: How many networks, of two hidden layers of 32.
         steps: The most steps of Adam.
         seed: Of samples and weights.
@@ -58,14 +58,14 @@ class NetworkDynamics(Dynamics):
     def __init__(
         self,
         spec: StateSpec,
-        physics: Physics | None = None,
+        physics: Physics,
         *,
         number: int = 10,
         steps: int = 1500,
         seed: int = 0,
     ) -> None:
         super().__init__(spec)
-        self.known = None if physics is None else PhysicsDynamics(spec, physics)
+        self.known = PhysicsDynamics(spec, physics)
         self.number, self.steps, self.seed = number, steps, seed
         self._read = [i for i, name in enumerate(spec.states) if name not in spec.exogenous]
         self._data: Trajectories | None = None
@@ -76,9 +76,9 @@ class NetworkDynamics(Dynamics):
         """True once there were transitions."""
         return self._networks is not None
 
-    def before_data(self) -> Dynamics | None:
-        """Itself, once there were transitions; f_p before."""
-        return self if self.is_fitted else self.known
+    def physics_alone(self) -> Dynamics:
+        """What there is before transitions."""
+        return self.known
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Train on these and earlier transitions."""
@@ -102,13 +102,6 @@ class NetworkDynamics(Dynamics):
         """The mean over the networks; the variance over them, and that of the noise."""
         each = self._of_all(states, actions)
         return Prediction(each.mean(0), each.var(0) + self.noise_variance(states, actions))
-
-    def sample(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Next states by a network for each row, and noise."""
-        each = self._of_all(states, actions)
-        following = each[torch.randint(self.number, (len(states),)), torch.arange(len(states))]
-        noise = self.noise_variance(states, actions)
-        return following + noise.sqrt() * torch.randn_like(following)
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """Networks, in a random order."""
@@ -171,9 +164,7 @@ class NetworkDynamics(Dynamics):
         return (X - mean) / sd
 
     def _physics(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The change of the predicted states by f_p, ``... x m``; 0 without it."""
-        if self.known is None:
-            return torch.zeros((), dtype=torch.float64)
+        """The change of the predicted states by f_p, ``... x m``."""
         actions = actions.expand(*states.shape[:-1], -1)
         following = self.known.mean_function()(states, actions)
         return self.spec.change(states, following)[..., self.spec.predicted]

@@ -15,17 +15,16 @@ def _without_gradients():
         yield
 
 
-@pytest.fixture(params=[1, 4], ids=["1-output", "4-outputs"])
-def m(request):
-    return request.param
+outputs = pytest.mark.parametrize("m", [1, 4])
 
 
 @pytest.fixture
 def data(m, uniform):
-    """500 points, one more, and 200 to predict at."""
+    """500 points, one more, and 200 to predict at; models of the 500."""
     X, Z = uniform(501, NUM_INPUTS), uniform(200, NUM_INPUTS, seed=1)
     Y = 1.3 * crude(X)[..., :m] + X[..., :m].square()
-    return X, Y + 0.01 * torch.randn(501, m, dtype=torch.float64), Z
+    Y = Y + 0.01 * torch.randn(501, m, dtype=torch.float64)
+    return X, Y, Z, build(X[:500], Y[:500]), SingleTaskGP(X[:500], Y[:500])
 
 
 def crude(X):
@@ -40,10 +39,10 @@ def moments(posterior):
     return posterior.mean, posterior.variance
 
 
+@outputs
 @pytest.mark.parametrize("other", ["posterior(Z)", "SingleTaskGP"])
 def test_predict(benchmark, record_ratio, data, m, other):
-    X, Y, Z = data
-    model, stock = build(X[:500], Y[:500]), SingleTaskGP(X[:500], Y[:500])
+    *_, Z, model, stock = data
     slow = {
         "posterior(Z)": lambda: moments(model.posterior(Z)),
         "SingleTaskGP": lambda: moments(stock.posterior(Z.unsqueeze(-2))),
@@ -52,10 +51,10 @@ def test_predict(benchmark, record_ratio, data, m, other):
     record_ratio(f"time of {other} / predict", slow[other], lambda: model.predict(Z))
 
 
+@outputs
 @pytest.mark.parametrize("other", ["rebuild", "SingleTaskGP"])
 def test_condition(benchmark, record_ratio, data, m, other):
-    X, Y, Z = data
-    model, stock = build(X[:500], Y[:500]), SingleTaskGP(X[:500], Y[:500])
+    X, Y, Z, model, stock = data
     stock.posterior(Z)
     z = Z[:1]
     model.predict(z)

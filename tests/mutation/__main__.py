@@ -1,5 +1,7 @@
 """Put one fault after the other into a copy of the repository, and see which test finds it.
 
+A fault of faults.txt: its file and what goes wrong, lines that are once in the file, and theirs.
+
 python tests/mutation                 # all of them
 python tests/mutation active rl       # those of some rooms
 python tests/mutation --check         # only see that they fit the code
@@ -14,16 +16,40 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-
-from faults import FAULTS, Fault
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 _LIMIT = 1200  # seconds, after which a run that hangs counts as found
 
 
-def check(faults: tuple[Fault, ...] = FAULTS) -> None:
+class Fault(NamedTuple):
+    """A text of a file, the one that takes its place, and what goes wrong then."""
+
+    file: str
+    old: str
+    new: str
+    why: str
+
+    @property
+    def room(self) -> str:
+        """The folder of the library that it is in, whose tests come first."""
+        return self.file.split("/")[1]
+
+
+def read() -> list[Fault]:
+    """All faults."""
+    faults = []
+    for entry in Path(__file__).with_name("faults.txt").read_text().rstrip("\n").split("\n\n"):
+        head, *lines = entry.split("\n")
+        file, why = head.split(": ", 1)
+        old, new = ("\n".join(line[1:] for line in lines if line[0] == mark) for mark in "-+")
+        faults.append(Fault(file, old, new, why))
+    return faults
+
+
+def check() -> None:
     """Raise a ValueError unless each old text is in its file, once."""
-    for fault in faults:
+    for fault in read():
         path = ROOT / fault.file
         found = path.read_text().count(fault.old) if path.exists() else 0
         if found != 1:
@@ -78,14 +104,11 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="see that the faults fit the code")
     parser.add_argument("--numprocesses", type=int, default=2, help="of pytest")
     arguments = parser.parse_args()
-    chosen = tuple(
-        fault
-        for fault in FAULTS
-        if not arguments.rooms or {fault.room, fault.file} & {*arguments.rooms}
-    )
-    check(chosen)
+    check()
     if arguments.check:
         return 0
+    asked = {*arguments.rooms}
+    chosen = [fault for fault in read() if not asked or {fault.room, fault.file} & asked]
     missed = 0
     print("| fault | found by | s |\n|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,8 +1,6 @@
 """What keeps the numbers true: quotes are those of their tables, and runs can be made again."""
 
-from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import ClassVar
 
 import pytest
 
@@ -10,9 +8,9 @@ from paper import check
 from paper.__main__ import EXPERIMENTS
 from paper.check import difference
 from paper.common import runner
-from paper.common.experiment import Axes, Experiment, Table
 from paper.common.runner import main, runs_file, stale_list, stamp
 from paper.pages import PAPER, QUOTING, results, wrong_quotes
+from tests.paper.toy import Toy
 
 TABLE = """| model, n | RMSE, m | held |
 | --- | --- | --- |
@@ -21,29 +19,15 @@ TABLE = """| model, n | RMSE, m | held |
 | GP, 9 |  | 0.5 |"""
 
 
-def quoted(text, place):
-    link = f'[{text}](x/tables.md#toy:all "{place}")' if place else f"[{text}](x/tables.md#toy:all)"
-    return wrong_quotes(f"It is {link}.", {"toy:All": TABLE})
-
-
-@pytest.mark.parametrize(
-    ("text", "place"),
-    [
-        ("0.27", "CKA, 5 :: RMSE, m"),
-        ("0.274 ± 0.02", "CKA, 5 :: RMSE, m"),
-        ("94 %", "CKA, 5 :: held"),
-        ("1,234", "GP, 5 :: RMSE, m"),
-        ("41 of 48", "GP, 5 :: held"),
-        ("all errors", ""),
-    ],
-)
-def test_a_number_is_quoted_as_it_is_or_rounded(text, place):
-    assert quoted(text, place) == []
-
-
 @pytest.mark.parametrize(
     ("text", "place", "words"),
     [
+        ("0.27", "CKA, 5 :: RMSE, m", None),
+        ("0.274 ± 0.02", "CKA, 5 :: RMSE, m", None),
+        ("94 %", "CKA, 5 :: held", None),
+        ("1,234", "GP, 5 :: RMSE, m", None),
+        ("41 of 48", "GP, 5 :: held", None),
+        ("all errors", "", None),
         ("0.28", "CKA, 5 :: RMSE, m", "the table has '0.274"),
         ("0.02 ± 0.274", "CKA, 5 :: RMSE, m", "the table has"),
         ("40 of 48", "GP, 5 :: held", "the table has"),
@@ -52,12 +36,11 @@ def test_a_number_is_quoted_as_it_is_or_rounded(text, place):
         ("0.27", "CKA, 5 :: RMSE", "there are 0 cells"),
     ],
 )
-def test_another_number_and_a_place_that_is_not_there_are_wrong(text, place, words):
-    (found,) = quoted(text, place)
-    assert words in found
-
-
-def test_a_table_that_is_not_there_is_wrong():
+def test_a_number_is_quoted_as_it_is_or_rounded(text, place, words):
+    title = f' "{place}"' if place else ""
+    wrong = wrong_quotes(f"It is [{text}](x/tables.md#toy:all{title}).", {"toy:All": TABLE})
+    assert len(wrong) == (words is not None)
+    assert all(words in quote for quote in wrong)
     assert "no such table" in wrong_quotes("[x](a/tables.md#toy:none)", {"toy:all": TABLE})[0]
 
 
@@ -77,36 +60,17 @@ def test_differences_of_runs():
     assert difference(old, {"none": 1.0}) == "none was None and is now 1.0"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Squares(Experiment):
-    """Squares, by code whose factor may change."""
-
-    runs: int = 2
-    jobs: int = 1
-    factor: ClassVar[float] = 1.0
-    axes: ClassVar[Axes] = {"learner": {"a": "the first", "b": "the second"}}
-    calls: ClassVar[tuple[str, ...]] = ()
-
-    def run(self, *case):
-        return {"value": self.factor * (case[1] + 1.0) * (case[0] == "a")}
-
-    def tables(self, runs):
-        return {"runs": Table("Runs", f"{len(runs)}")}
-
-    def draw(self, runs):
-        return []
-
-
 @pytest.fixture
 def squares(tmp_path, monkeypatch):
     """An experiment whose runs are there, as `check` sees it."""
     monkeypatch.setattr(runner, "commit_of", lambda root: ("f" * 40, "2026-01-01"))
-    experiment = Squares(out=tmp_path / "results")
+    (tmp_path / "results").mkdir()
+    experiment = Toy(out=tmp_path / "results", runs=2)
     main(experiment)
     monkeypatch.setattr(check, "PAPER", tmp_path)
     monkeypatch.setattr(runner, "STALE", tmp_path / "stale.txt")
     monkeypatch.setattr("os.cpu_count", lambda: 1)
-    return experiment, {"squares": f"{__name__}:Squares"}
+    return experiment, {"toy": "tests.paper.toy:Toy"}
 
 
 def test_a_change_of_the_code_makes_a_learner_stale(squares, monkeypatch):
@@ -114,9 +78,9 @@ def test_a_change_of_the_code_makes_a_learner_stale(squares, monkeypatch):
     runs = [*runs_file(experiment).read().values()]
     assert check.check(known) == {}
     assert stamp(experiment, runs) == "*Runs: 4 by ffffffff of 2026-01-01.*"
-    monkeypatch.setattr(Squares, "factor", 2.0)
-    assert [*check.check(known)] == ["squares a"]
-    runner.STALE.write_text("squares a\n")
+    monkeypatch.setattr(Toy, "run", lambda self, kind, seed: {"value": {"a": 9, "b": seed}[kind]})
+    assert [*check.check(known)] == ["toy a"]
+    runner.STALE.write_text("toy a\n")
     assert check.check(known, known=False) == {}
     assert stamp(experiment, runs).endswith(" Stale: today's code gives other numbers (a).*")
 
@@ -128,9 +92,7 @@ def test_runs_of_unrecorded_code_are_stale_without_being_made_again(squares):
     file.path.unlink()
     for run in runs:
         file.append(run)
-    assert check.check(known) == dict.fromkeys(
-        ["squares a", "squares b"], "its commit is not recorded"
-    )
+    assert check.check(known) == dict.fromkeys(["toy a", "toy b"], "its commit is not recorded")
 
 
 @pytest.mark.slow

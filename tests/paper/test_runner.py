@@ -13,44 +13,13 @@ import pytest
 from cloudpickle import register_pickle_by_value, unregister_pickle_by_value
 
 from paper.common import runner
-from paper.common.experiment import Axes, Experiment, Table
+from paper.common.experiment import Axes, Experiment
 from paper.common.runner import Refused, main, run_missing, runs_file
 from paper.common.runs import RunsFile, commit_of, versions
+from tests.paper import toy
+from tests.paper.toy import Toy
 
 ROOT = Path(__file__).parents[2]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Toy(Experiment):
-    """Squares; cases write down that they were run."""
-
-    runs: int = 3
-    jobs: int = 1
-    scale: float = 1.0
-    missing: bool = False
-
-    axes: ClassVar[Axes] = {"kind": {"a": "the first", "b": "the second"}}
-    packages: ClassVar[tuple[str, ...]] = ("gpadjust", "numpy")
-
-    def check(self):
-        if self.missing:
-            raise ImportError("It needs a simulator; install it.")
-
-    def describe(self, *kind):
-        return {"scale": self.scale, "inner": {"kind": kind[0]}}
-
-    def run(self, *case):
-        if (self.out / "stop").exists() and case == ("a", 1):
-            raise KeyboardInterrupt
-        with open(self.out / "log", "a") as log:
-            log.write(f"{case}\n")
-        return {"value": self.scale * case[1] ** 2, "nothing": float("nan")}
-
-    def tables(self, runs):
-        return {"runs": Table("Runs", f"{len(runs)}")}
-
-    def draw(self, runs):
-        return []
 
 
 def calls(out):
@@ -58,18 +27,19 @@ def calls(out):
 
 
 def test_all_tasks_are_run_once_and_shown(tmp_path, capsys):
-    toy = Toy(out=tmp_path)
-    main(toy)
+    squares = Toy(out=tmp_path)
+    main(squares)
     assert "Runs\n\n6\n" in capsys.readouterr().out
     assert "<!-- toy:runs -->\n6\n\n*Runs: 6 by" in (tmp_path / "toy" / "tables.md").read_text()
     assert calls(tmp_path)[0] == "('a', 0)"
-    record = runs_file(toy).read()["b", 2]
+    record = runs_file(squares).read()["b", 2]
     assert (record["value"], record["nothing"]) == (4, None)
     assert record["settings"] == {"scale": 1.0, "inner": {"kind": "b"}}
     assert record["versions"] == versions(Toy.packages)
     assert (record["commit"], record["date"]) == (commit_of(ROOT) or (None, None))
     assert record["took"] >= 0
-    main(toy)
+    main(squares)
+    main(replace(squares, only_tables=True, runs=4))
     assert len(calls(tmp_path)) == 6
 
 
@@ -86,18 +56,12 @@ def test_an_interrupted_call_goes_on_and_a_larger_one_adds(tmp_path):
 
 @pytest.mark.slow
 def test_runs_in_other_processes(tmp_path):
-    register_pickle_by_value(sys.modules[__name__])  # which they cannot import
+    register_pickle_by_value(toy)  # which they cannot import
     try:
         main(Toy(out=tmp_path, jobs=2, runs=2))
     finally:
-        unregister_pickle_by_value(sys.modules[__name__])
+        unregister_pickle_by_value(toy)
     assert len(runs_file(Toy(out=tmp_path)).read()) == 4
-
-
-def test_only_tables_runs_nothing(tmp_path):
-    main(Toy(out=tmp_path, runs=2))
-    main(Toy(out=tmp_path, only_tables=True))
-    assert len(calls(tmp_path)) == 4
 
 
 @pytest.mark.parametrize(
@@ -211,15 +175,15 @@ def test_a_commit_is_that_of_the_repository_and_says_if_files_are_changed(tmp_pa
 
 def test_a_torn_line_is_not_read_and_not_glued_to_the_next(tmp_path, monkeypatch):
     monkeypatch.setattr("time.process_time", lambda: 0.0)
-    toy = Toy(out=tmp_path, runs=2)
-    run_missing(toy)
-    path = toy.folder / runner.RUNS
+    squares = Toy(out=tmp_path, runs=2)
+    run_missing(squares)
+    path = squares.folder / runner.RUNS
     whole = path.read_bytes()
     lines = whole.splitlines(keepends=True)
     for cut in (1, 10, len(lines[-1]) - 1):  # of the last run
         path.write_bytes(whole[: -len(lines[-1])] + lines[-1][:cut])
-        assert len(runs_file(toy).read()) == 3
-        run_missing(toy)
+        assert len(runs_file(squares).read()) == 3
+        run_missing(squares)
         assert path.read_bytes() == whole
 
 
@@ -244,42 +208,19 @@ def test_a_full_disk_loses_only_what_is_being_written(tmp_path, monkeypatch):
     assert file.path.read_bytes() == before
 
 
-@pytest.mark.slow
-def test_a_killed_process_leaves_whole_runs(tmp_path):
-    code = (
-        "import os, sys\nfrom pathlib import Path\n"
-        "from paper.common.runs import RunsFile\n"
-        "file = RunsFile(Path(sys.argv[1]), ('seed',))\n"
-        "for seed in range(200):\n    file.append({'seed': seed, 'x': [0.5] * 1000})\n"
-        "    if seed == 20:\n        os.kill(os.getpid(), 9)\n"
-    )
-    path = tmp_path / "runs.jsonl"
-    made = subprocess.run([sys.executable, "-c", code, str(path)], cwd=ROOT, check=False)
-    assert made.returncode == -9
-    assert len(RunsFile(path, ("seed",)).read()) == 21
-    RunsFile(path, ("seed",)).append({"seed": 21})  # the lock went with the process
-    assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == [*range(22)]
-
-
 def test_how_runs_were_made_is_written_once(tmp_path):
+    """In files that name it by a text, too, as until November 2026."""
     file = RunsFile(tmp_path / "runs.jsonl", ("seed",))
-    runs = [{"seed": i, "settings": {"scale": i // 2}, "commit": None, "x": 0.5} for i in range(4)]
-    for run in runs:
+    made = {"settings": {"scale": 1}, "commit": None}
+    lines = [{"made_by": "8f0c", "identifying": made}, {"made_by": "8f0c", "seed": 0}]
+    file.path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    runs = [{"seed": 0, **made}, {"seed": 1, "x": 0.5, **made}]
+    runs += [{"seed": seed, "settings": {"scale": 2}, "commit": None} for seed in (2, 3)]
+    for run in runs[1:]:
         file.append(run)
     assert list(file.read().values()) == runs
     assert file.path.read_text().count("scale") == 2
     assert len(file.path.read_text().splitlines()) == 6
-
-
-def test_runs_that_name_how_they_were_made_are_read_and_added_to(tmp_path):
-    """As until November 2026."""
-    file, made = RunsFile(tmp_path / "runs.jsonl", ("seed",)), {"settings": {"scale": 1}}
-    lines = [{"made_by": "8f0c", "identifying": made}, {"made_by": "8f0c", "seed": 0}]
-    file.path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
-    file.append({"seed": 1, **made})
-    file.append({"seed": 2, "settings": {"scale": 2}})
-    assert [run["settings"]["scale"] for run in file.read().values()] == [1, 1, 2]
-    assert file.path.read_text().count("scale") == 2
 
 
 def test_help_is_quick_and_imports_nothing_slow():

@@ -1,6 +1,7 @@
 """CKARegressor in scikit-learn's own checks, in its tools, and against the library's models."""
 
 import pickle
+from dataclasses import dataclass
 from functools import partial
 
 import cloudpickle
@@ -21,7 +22,6 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from gpadjust import (
     CKA,
     BlackBoxPhysics,
-    PhysicsError,
     PhysicsMeanGP,
     PhysicsWarning,
     Unknown,
@@ -32,7 +32,7 @@ from gpadjust import (
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.links import LinkedCKA
 from gpadjust.sklearn import CKARegressor
-from tests.systems import refused
+from tests.systems import refused, same
 
 
 def wave(X):
@@ -62,17 +62,12 @@ def data():
 Z = np.linspace(-0.2, 1.2, 7).reshape(-1, 1)
 
 
-class Named:
+@dataclass
+class Wave:
     """A function whose repr, and so the names of tests, is the same in all processes."""
 
-    def __init__(self, function):
-        self.function = function
-
     def __call__(self, X):
-        return self.function(X)
-
-    def __repr__(self):
-        return self.function.__name__
+        return wave(X)
 
 
 def expected_failures(regressor):
@@ -87,12 +82,7 @@ def expected_failures(regressor):
 @pytest.mark.filterwarnings("ignore:Predictions depend on the seed")  # in data of noise alone
 @pytest.mark.slow
 @parametrize_with_checks(
-    [
-        CKARegressor(fit_method="map"),
-        CKARegressor(),
-        fast(Named(wave)),
-        CKARegressor(Named(torch_wave)),
-    ],
+    [CKARegressor(), fast(Wave())],
     legacy=True,
     expected_failed_checks=expected_failures,
 )
@@ -158,11 +148,16 @@ def test_shapes_are_those_of_a_gaussian_process_regressor(data, columns):
         for regressor in (fast(None).fit(X, Y), GaussianProcessRegressor(optimizer=None).fit(X, Y))
     )
     assert [each.shape for each in ours] == [each.shape for each in expected]
-    regressor = fast(waves, fit_method="bayes").fit(X, np.column_stack([y, y**2 + X[:, 0]]))
+
+
+def test_covariances_of_two_outputs(data):
+    X, y = data
+    Y = np.column_stack([y, y**2 + X[:, 0]])
+    regressor = fast(waves, fit_method="bayes").fit(X, Y)
     _, std = regressor.predict(Z, return_std=True)
     _, covariance = regressor.predict(Z, return_cov=True)
     np.testing.assert_allclose(np.einsum("iij->ij", covariance), std**2, rtol=1e-4)
-    assert regressor.score(X, np.column_stack([y, y**2 + X[:, 0]])) > 0.9
+    assert regressor.score(X, Y) > 0.9
 
 
 @pytest.mark.parametrize(("method", "noise"), [("bayes", True), ("map", False)])
@@ -188,14 +183,12 @@ def test_moments_of_draws(data, method, noise):
 def test_the_seed_of_the_fit(data):
     def scales(state):
         regressor = CKARegressor(wave, random_state=state, num_draws=16)
-        return [p.detach() for p in regressor.fit(*data).model_.parameters()]
+        return [p.detach().flatten() for p in regressor.fit(*data).model_.parameters()]
 
-    def same(a, b):
-        return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
-
-    assert same(scales(5), scales(5))
-    assert not same(scales(5), scales(6))
-    assert same(scales(np.random.RandomState(0)), scales(np.random.RandomState(0)))
+    fits = [scales(5), scales(5), scales(np.random.RandomState(0))]
+    same(fits[0], fits[1], rtol=0, atol=0)
+    same(fits[2], scales(np.random.RandomState(0)), rtol=0, atol=0)
+    assert not torch.equal(torch.cat(fits[0]), torch.cat(scales(6)))
 
 
 def test_parameters_are_left_as_they_are(data):
@@ -266,16 +259,6 @@ def test_grid_search_over_models_and_physics(data):
     assert np.isfinite(search.fit(X, y).cv_results_["mean_test_score"]).all()
 
 
-def test_other_tools(data):
-    X, y = data
-    rows = np.random.RandomState(0).permutation(len(X))
-    assert cross_val_score(fast(), X[rows], y[rows], cv=2, n_jobs=1).mean() > 0.8
-    doubled = TransformedTargetRegressor(
-        fast(lambda X: wave(X) / 2), func=lambda y: y / 2, inverse_func=lambda y: 2 * y
-    )
-    np.testing.assert_allclose(doubled.fit(X, y).predict(X), fast().fit(X, y).predict(X), rtol=1e-6)
-
-
 def test_a_frame_gives_names(data):
     X, y = data
     frame = pd.DataFrame({"time": X[:, 0], "load": X[:, 0] ** 2})
@@ -293,29 +276,16 @@ def test_a_frame_gives_names(data):
 
 def test_kinds_of_data(data):
     X, y = data
-    for options in ({"link": (-5.0, 5.0)}, {"noise": HeavyTails()}):
+    for options, kind in (({"link": (-5.0, 5.0)}, LinkedCKA), ({"noise": HeavyTails()}, CKA)):
         regressor = fast(model_options=options).fit(X, y)
         _, std = regressor.predict(Z, return_std=True)
         _, covariance = regressor.predict(Z, return_cov=True)
+        assert type(regressor.model_) is kind
         assert regressor.score(X, y) > 0.9
         assert (std > 0).all()
         assert np.allclose(np.diag(covariance), std**2)
         assert np.linalg.eigvalsh(covariance).min() > -1e-9 * covariance.max()
         assert regressor.sample_y(Z, 2).shape == (7, 2)
-    assert isinstance(fast(model_options={"link": (-5, 5)}).fit(X, y).model_, LinkedCKA)
-
-
-def test_texts_of_a_frame_are_categories(data):
-    X, y = data
-    frame = pd.DataFrame({"x": np.tile(X[:, 0], 2), "metal": ["iron"] * 10 + ["zinc"] * 10})
-    y = np.concatenate([y, y + 1])
-    regressor = fast(lambda X: wave(X)).fit(frame, y)
-    mean = regressor.predict(pd.DataFrame({"x": [0.5, 0.5], "metal": ["iron", "zinc"]}))
-    assert mean[1] - mean[0] == pytest.approx(1, abs=0.2)
-    assert regressor.sample_y(frame).shape == (20, 1)
-    assert regressor.feature_names_in_.tolist() == ["x", "metal"]
-    lead = pd.DataFrame({"x": [0.5], "metal": ["lead"]})
-    refused(ValueError, "lead", regressor.predict, lead)
 
 
 def test_known_variances_are_taken_apart_with_the_rows(data):
@@ -332,10 +302,7 @@ def test_known_variances_are_taken_apart_with_the_rows(data):
 def test_kinds_of_arrays(data):
     X, y = data
     expected = fast().fit(X, y).predict(Z)
-    for regressor in (fast(), pickle.loads(pickle.dumps(fast())), clone(fast())):
-        np.testing.assert_array_equal(regressor.fit(X, y.reshape(-1, 1)).predict(Z), expected)
-    backward = fast().fit(X[::-1], y[::-1])
-    np.testing.assert_allclose(backward.predict(Z[::-1]), backward.predict(Z)[::-1], rtol=1e-9)
+    np.testing.assert_array_equal(clone(fast()).fit(X, y.reshape(-1, 1)).predict(Z), expected)
     X.setflags(write=False)
     for made in (np.ndarray.tolist, np.float32, torch.tensor, np.asarray):
         found = fast().fit(made(X.copy() if made is torch.tensor else X), made(y)).predict(made(Z))
@@ -374,13 +341,8 @@ REFUSED = [
     ({"model": 3}, TypeError, r"callable \(X, Y, \*\*physics\) .*found 3"),
     ({"model": lambda X, Y, physics: X}, TypeError, "to make a gpadjust Predictive; found nda"),
     ({"model": "rra", "physics": None}, ValueError, "without one take model='zero_mean'"),
-    ({"physics": "wave"}, TypeError, "physics must be a Physics or a callable"),
-    ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),
-    ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes', 'map' or 'nuts'"),
     ({"num_draws": 3}, ValueError, "a multiple of 4, from 4 on; found 3"),
     ({"num_draws": 8.0}, TypeError, "num_draws must be a whole number; found 8.0"),
-    ({"num_draws": "many"}, TypeError, "num_draws must be a whole number; found 'many'"),
-    ({"num_draws": True}, TypeError, "num_draws must be a whole number; found True"),
     ({"model": partial(CKA, centre=0)}, TypeError, "option 'centre' of CKA"),
     ({"physics": None, "model": CKA}, TypeError, "argument: 'physics'"),
     ({"model_options": ["log"]}, TypeError, "Expected model_options as a dictionary"),
@@ -396,20 +358,10 @@ def test_bad_parameters(data, parameters, error, words):
     assert not hasattr(regressor, "model_")
 
 
-BAD_DATA = [
-    (lambda X, y: (X * np.nan, y), "Input X contains NaN"),
-    (lambda X, y: (X, y * np.nan), "Input y contains NaN"),
-    (lambda X, y: (X, y * 1j), "Complex data not supported"),
-    (lambda X, y: (X[:, 0], y), "Expected 2D array, got 1D"),
-    (lambda X, y: (X, y[1:]), "inconsistent numbers of samples"),
-    (lambda X, y: (X[:1], y[:1]), "minimum of 2 is required"),
-    (lambda X, y: (X, np.column_stack([y, y])), "Expected 2 outputs of physics 'wave'"),
-]
-
-
 def test_bad_data_and_requests(data):
-    for change, words in BAD_DATA:
-        refused(ValueError, words, fast().fit, *change(*data))
+    X, y = data  # scikit-learn's checks have other bad data
+    words = "Expected 2 outputs of physics 'wave'"
+    refused(ValueError, words, fast().fit, X, np.column_stack([y, y]))
     refused(NotFittedError, "not fitted", fast().predict, Z)
     predict = fast().fit(*data).predict
     words = "return_std or return_cov, got both"
