@@ -5,11 +5,11 @@ import sys
 from html.parser import HTMLParser
 
 import pytest
-import torch
 
 from gpadjust.__main__ import main
 from gpadjust.report.markup import Markup
 from gpadjust.validation import compare
+from tests.systems import line, normal, wave
 
 VOID = {"meta", "img", "br"}
 
@@ -92,8 +92,6 @@ def folder(tmp_path, monkeypatch):
     """The working directory, and modules of its own."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    for name in ("hill", "broken", "lacks", "swing"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
     yield tmp_path
     for name in ("hill", "broken", "lacks", "swing"):
         sys.modules.pop(name, None)
@@ -128,15 +126,9 @@ def undrawn(monkeypatch):
         monkeypatch.setattr(f"gpadjust.report.log_page.{name}", lambda *args: Markup())
 
 
-def f_p(X):
-    return torch.sin(6 * X[:, :1])
-
-
 @pytest.fixture(scope="session")
 def comparison():
     """Of ten noisy points of a wave."""
-    generator = torch.Generator().manual_seed(0)
-    X = torch.linspace(0, 1, 10, dtype=torch.float64).unsqueeze(-1)
-    Y = 2 * f_p(X) + X + 0.1 * torch.randn(10, 1, generator=generator, dtype=torch.float64)
-    structures = ["zero mean", "physics mean", "CKA"]
-    return compare(X, Y, f_p, structures=structures)
+    X = line(10)
+    Y = 2 * wave(X) + X + 0.1 * normal(10, 1)
+    return compare(X, Y, wave, structures=["zero mean", "physics mean", "CKA"])
