@@ -82,6 +82,8 @@ SLOW = ODEPhysics(lambda x, u: x, step=0.2, state_dim=2)
 FRAGILE = FunctionPhysics(lambda X: torch.where(X[:, :2] > 0.9, NAN, X[:, :2]))
 IN_STEPS = partial(Records(moved(), StateSpec(["x", "v"], ["u"], step=0.2)).trajectories, 0.4)
 
+GAIN = Sensors(["x"], gain={"x": Unknown(1.0, factor=2.0)})
+
 SLOWER = r".* multiple of the sampling step, 0\.2, got 0\.1; take 0\.2"
 UNEVEN_STEPS = r".* a tenth of its step 0\.1"
 
@@ -142,6 +144,7 @@ REFUSED = [
     (lambda: sensed(function=lambda states: states), "without a function"),
     (lambda: sensed(gain={"x": 2.0}), TypeError, "unknowns must map names to Unknown"),
     (lambda: sensed(gain={"y": Unknown(1.0, factor=2.0)}), "Unknown output of gain 'y'"),
+    (lambda: GAIN.measure(POINT, torch.zeros(1, 2)), "unknown gain, offset or delay is for `smo"),
     # Identification, and the check before it
     (lambda: identified(moved()), TypeError, r"Records\(\[record"),
     (lambda: identified(held_out=0.7), "at most 0.5"),
@@ -166,6 +169,8 @@ def test_a_search_that_does_not_settle():
     assert not unsettled.is_settled
     with pytest.raises(TypeError, match="seed must be a whole number"):
         unsettled.draw(1.5)
+    with pytest.raises(ValueError, match="found no unknown parameters"):
+        unsettled.variation  # noqa: B018
 
 
 FILES = {
