@@ -39,8 +39,9 @@ def late_log(seed):
     rates = lambda x, v, u: (v, u - k * x - c * v)  # noqa: E731
     path = simulated(rates, [0.5, 0.0], np.repeat(forces, FINE), h, fine=1)[:, 0]
     late = np.interp(np.arange(ROWS) * FINE - delay / h, np.arange(len(path)), path)
-    states = np.stack([gain * late + offset, late], -1)
-    return log_of(SPEC, STEP, states, forces, [0.01, math.nan], rng), [k, c, gain, offset, delay]
+    measured = gain * late + offset + 0.01 * rng.normal(size=ROWS)
+    records = log_of(SPEC, STEP, np.stack([measured, late], -1), forces, [0, math.nan], rng)
+    return records, [k, c, gain, offset, delay]
 
 
 def test_the_outputs_near_a_path_are_those_of_the_linear_chain():

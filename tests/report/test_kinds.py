@@ -7,8 +7,6 @@ import sys
 import pandas
 import pytest
 import torch
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
 
 from gpadjust.core import CKA, CalibratedPhysics, ScaleGP, StackedGP, fit, load
 from gpadjust.kinds.ar1 import AR1
@@ -34,10 +32,7 @@ def physics(m):
 
 
 @pytest.mark.slow
-@settings(max_examples=2, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.text(min_size=1, max_size=12), st.text(min_size=1, max_size=12))
-@example(NASTY[0], NASTY[1])
-@example(NASTY[1], NASTY[2])
+@pytest.mark.parametrize(("first", "second"), [NASTY[:2], NASTY[1:]])
 def test_any_names_make_a_page(tmp_path, read, monkeypatch, first, second):
     monkeypatch.chdir(tmp_path)
     X, Y = problem(2, 1)

@@ -1,7 +1,6 @@
 """What a page says is what the comparison says, and it is a page by itself."""
 
 import dataclasses
-import re
 from unittest.mock import Mock
 
 import pytest
@@ -246,13 +245,11 @@ def test_where_a_physics_fails_is_told_in_a_line():
 
 
 @settings(max_examples=30)
-@given(st.lists(st.text(), min_size=2, max_size=4))
+@given(st.lists(st.text(st.characters(exclude_categories=["Cc", "Cn", "Cs"])), min_size=2))
 def test_any_text_comes_back_from_the_markup(texts):
-    first, *others = [re.sub(r"[\0\r\ud800-\udfff]", "", text) for text in texts]
-    html = tag("main", table(first, texts, [[first, *others]]), id=first)
-    page = Page(html)
-    assert page.ids == [first]
-    assert page.tables[first][1] == [first, *others]
+    page = Page(tag("main", table(texts[0], texts, [texts]), id=texts[0]))
+    assert page.root[0].get("id") == texts[0]
+    assert page.tables[texts[0]][1] == texts
 
 
 def test_numbers_names_with_units_counts_and_lists():
