@@ -193,6 +193,7 @@ REFUSED = [
     option("--physics", "swing:physics", "Expected swing:physics alone"),
     option("--physics", "x' = rate", "each of angle, rate.* equations for angle, rate, x"),
     option("--held-out", "0.8", "at most 0.5"),
+    (["identify", "log.csv", "--states", "pi=angle", "--physics", "pi_' = pi"], "'pi' of your own"),
     option("--step", "0.013", "whole multiple of the sampling step"),
     (
         ["identify", "log.csv", *STATES, "--physics", "swing:fails", "--step", "0.05"],
@@ -219,16 +220,6 @@ def test_refused(folder, fails):
     (folder / "log.html").write_text(LOG)  # is never overwritten
     command = ["identify", "log.html", *STATES, *VISCOUS, "--out", "log.html"]
     fails(command, "log.html is the data")
-
-
-def test_a_column_pi_is_never_the_constant(folder, fails):
-    rows = "".join(f"{k / 2},{5 * 0.9**k},{k}\n" for k in range(24))
-    (folder / "log.csv").write_text(f"time,T,pi\n{rows}")
-    command = ["identify", "log.csv", "--states", "T", "--unknown", "q = 0.5 .. 1", "--physics"]
-    words = "formulas take it as 3.14159, and here is a 'pi' of your own"
-    for more in ([], ["--actions", "pi"]):
-        fails([*command, "T = q*T + 0*pi", *more], words)
-    fails([*command, "pi = T"], "an equation for each of T")
 
 
 def test_a_log_with_dates_other_names_and_units_in_round_brackets(folder, read, capsys, undrawn):

@@ -131,6 +131,7 @@ def test_errors_and_coverage_are_without_outliers(tmp_path, read):
     Y = f_p(X) + 0.3 * X + 0.03 * normal(20, 1)
     Y[5] += 20
     comparison = compare(X, Y, f_p, noise=HeavyTails(), structures=["CKA"])
+    assert comparison.leave_one_out().is_outlier.nonzero()[:, 0].tolist() == [5]
     alone = float((Y - f_p(X))[torch.arange(20) != 5].square().mean().sqrt())
     assert comparison.errors()["y"]["physics alone"] == pytest.approx(alone)
     names = [f"line {i + 2}" for i in range(20)]

@@ -24,9 +24,10 @@ from .conftest import Page
 
 
 @pytest.mark.slow
-def test_a_comparison(comparison, tmp_path, read):
-    path = report(comparison, tmp_path / "report.html", rows=range(2, 12), settings={"seed": 7})
-    assert {file.name for file in tmp_path.iterdir()} == {"report.html", "report.pt"}
+def test_a_comparison(comparison, tmp_path, read, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = report(comparison, "a b.html", rows=range(2, 12), settings={"seed": 7})
+    assert {file.name for file in tmp_path.iterdir()} == {"a b.html", "a b.pt"}
     page = read(path)
     assert page.needs_nothing_else()
     assert path.stat().st_size < 500_000
@@ -59,25 +60,19 @@ def test_a_comparison(comparison, tmp_path, read):
     assert numbers == pytest.approx(expected, rel=1e-3)
     coverage = {row[0]: row[1] for row in page.tables["Coverage of left-out intervals"]}
     assert coverage["y, 80 %"] == f"{round(10 * float(loo.score(0.8).coverage))} of 10"
-
-
-def _three(comparison):
-    alone, adjusted, data = map(number, comparison.errors()["y"].values())
-    words = f"your formula {alone} adjusted {adjusted} data alone {data}"
-    return f"{words} root mean square errors of left-out observations"
-
-
-def test_the_code_in_the_page_predicts_as_the_model(
-    comparison, tmp_path, read, monkeypatch, undrawn
-):
-    monkeypatch.chdir(tmp_path)
-    page = read(report(comparison, "a b.html"))
+    # Its code predicts as the model.
     code, names = page.loading_code(), {}
     assert "load('a b.pt', trusted=True)" in code
     assert "by its name" in page.text
     exec(code, names)
     torch.testing.assert_close(names["mean"], comparison.recommended.predict(names["X"]).mean)
     assert names["lower"] < names["mean"] < names["upper"]
+
+
+def _three(comparison):
+    alone, adjusted, data = map(number, comparison.errors()["y"].values())
+    words = f"your formula {alone} adjusted {adjusted} data alone {data}"
+    return f"{words} root mean square errors of left-out observations"
 
 
 def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch, undrawn):
