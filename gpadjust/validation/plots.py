@@ -22,7 +22,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from statistics import NormalDist
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +47,7 @@ from gpadjust.physics.unknown import Curve
 from gpadjust.validation.comparison import Comparison
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.scores import Scores
-from gpadjust.validation.trust import SIDES, Trust, physics_at
+from gpadjust.validation.trust import SIDES, Trust, half_width, physics_at
 from gpadjust.validation.verdict import ALONE, CALIBRATED, name_of
 from gpadjust.words import labelled
 
@@ -228,7 +227,7 @@ def plot_leave_one_out(
         raise TypeError(
             f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
         )
-    z = quantile(level)
+    z = half_width(level)
     mean = column(loo.mean, output)
     residuals = column(loo.residuals, output)
     axes = axes_of(axes, 1, 2)[0]
@@ -320,7 +319,7 @@ def _plot_curve(ax: Axes, curve: Curve, unknown: Unknown) -> None:
     draws = curve(x)
     ends = draws.quantile(draws.new_tensor([0.025, 0.975]), dim=0)
     band(ax, x, [draws.mean(0), *ends], 0.95)
-    half = quantile(0.95)
+    half = half_width(0.95)
     for end in unknown.value(torch.tensor([-half, half]).double()).tolist():
         ax.axhline(end, color=GREY, ls=":", lw=1.0)
 
@@ -535,12 +534,6 @@ def _symbol(name: str) -> str:
     if symbol not in ("rho", "delta"):
         return name
     return name_of(rf"$\{symbol}$", physics)
-
-
-def quantile(level: float) -> float:
-    """Return half the width of the central interval, in standard deviations."""
-    check_level(level)
-    return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def mean_and_ends(marginals: Marginals, output: int, level: float) -> tuple[Tensor, ...]:

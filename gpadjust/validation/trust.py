@@ -102,7 +102,7 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
         >>> bool(shares.data > 0.3), bool(shares.neither < 0.1)
         (True, True)
     """
-    check_level(level)
+    width = half_width(level)
     if not isinstance(model, Predictive) or not getattr(model, "physics", None):
         raise TypeError(
             f"Expected a model with a physics to trust, such as CKA; found {type(model).__name__}. "
@@ -125,9 +125,15 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
     least = _NOTHING * _rms(data.Y - data.Y.nanmean(0))
     least = least.clamp_min(torch.finfo(least.dtype).tiny)
     # w = z sigma, z the quantile of the level
-    half = torch.maximum(NormalDist().inv_cdf((1 + level) / 2) * variance.sqrt(), least)
+    half = torch.maximum(width * variance.sqrt(), least)
     doubt = half / torch.maximum(discrepancy, least)
     return Trust(points, distance / half, doubt, data.input_names, data.output_names)
+
+
+def half_width(level: float) -> float:
+    """Return half the width of the central interval, in standard deviations."""
+    check_level(level)
+    return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def prior_mean(model: Any, X: Tensor) -> Tensor:
