@@ -126,5 +126,4 @@ def plot_lack(lack: Lack, *, units: Mapping[str, str] | None = None, ax: Any = N
         over = f"{lack.over}, {lack.lag:.2g} late, less {lack.over}"
     ax.set(xlabel=over, ylabel=f"{lack.state}' lacks, in {rate}")
     legend(ax)
-    tidy(ax)
     return ax

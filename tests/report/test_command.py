@@ -247,6 +247,7 @@ UNKNOWNS = {
     "c=-2+-1": Unknown(-2.0, sd=1.0),
     "c=1e-3 */ 2": Unknown(1e-3, factor=2.0),
     "c=0.1..0.3": Unknown(0.2, bounds=(0.1, 0.3)),
+    "c(x: 0 .. 2) = 1 */ 3": Unknown(1.0, factor=3.0, function_of="x", between=(0.0, 2.0)),
 }
 
 
@@ -274,7 +275,7 @@ def test_a_formula_names_its_inputs_and_is_in_the_file(folder, read, capsys, und
     assert names["model"].physics[0].unknowns == {"a": unknown_of("a=1 +- 50 %")[1]}
 
 
-def test_inputs_are_those_of_the_option_of_formulas_and_groups(fitted, capsys):
+def test_inputs_are_those_of_the_option_of_formulas_and_groups(fitted, fails, capsys):
     rows = [f"{x},R{i % 2},{y}" for i, (x, y) in enumerate(ROWS)]
     header = "time [s],rig,head [m]"
     model = fitted(header, rows, *FORMULA, "--batches", "rig")
@@ -287,17 +288,12 @@ def test_inputs_are_those_of_the_option_of_formulas_and_groups(fitted, capsys):
     assert words in capsys.readouterr().err
     assert levels_of(model) == {1: ("R0", "R1")}
     assert model.data.transform.batches == []
-    rows = [f"{x},{x},R{i % 2},{y}" for i, (x, y) in enumerate(ROWS)]
-    options = ["--inputs", "q=air flow,rig", "--physics", "q + sin(6*in)", "--outputs", "h"]
+    rows = [f"{x},{x},id{i},{y}" for i, (x, y) in enumerate(ROWS)]  # texts that do not repeat
+    options = ["--inputs", "q=air flow", "--physics", "q + sin(6*in)", "--outputs", "h"]
     model = fitted("in [s],air flow,rig,h", rows, *options)
-    assert model.data.input_names == ("q", "rig", "in [s]")
-
-
-def test_texts_that_do_not_repeat_are_not_categories(folder, fails):
-    rows = [f"{x},id{i},{y}" for i, (x, y) in enumerate(ROWS)]
-    (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
-    command = [*COMMAND, *WAVE, "--inputs", "time,rig"]
-    fails(command, r"column 2 \('rig'\): expected a number")
+    assert model.data.input_names == ("q", "in [s]")
+    command = ["report", "data.csv", *options, "--inputs", "q=air flow,rig"]
+    fails(command, r"column 3 \('rig'\): expected a number")
 
 
 def test_formulas_of_several_forms(fitted, folder, read):

@@ -12,7 +12,6 @@ from gpadjust.__main__ import main
 from gpadjust.physics import Unknown
 from gpadjust.records import Identification, Records
 from gpadjust.report import log_page, report
-from gpadjust.report.inputs import unknown_of
 from gpadjust.report.subject import Origin
 from tests.records.test_identification import SPEC, oscillation, quickly, spring
 
@@ -253,8 +252,3 @@ def test_actions_within_a_step_are_followed(folder, undrawn, capsys):
     given += ["--physics", "x' = u - c*x", "--unknown"]
     assert main([*given, "c [1/s] = 1 */ 3"]) == 0
     assert "c = 2 (2 to 2) 1/s" in capsys.readouterr().out
-
-
-def test_a_parameter_may_be_a_function():
-    function = Unknown(1.0, factor=3.0, unit="1/s", function_of="x", between=(0.0, 2.0))
-    assert unknown_of("c(x: 0 .. 2) [1/s] = 1 */ 3") == ("c", function)
