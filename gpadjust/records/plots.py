@@ -12,13 +12,13 @@ from typing import Any
 import matplotlib.pyplot as plt
 import torch
 
+from gpadjust.checks import checked_half_width
 from gpadjust.dynamics.plots import going_on, labels, plot_free_run
 from gpadjust.records.identification import IDENTIFIED, Identification
 from gpadjust.records.lack import Lack
 from gpadjust.records.records import Record, Records
 from gpadjust.states import StateSpec
 from gpadjust.validation.plots import BLUE, DOTS, GREY, given_axes, legend, tidy
-from gpadjust.validation.trust import half_width
 
 __all__ = ["plot_identification", "plot_lack", "plot_record"]
 
@@ -112,7 +112,7 @@ def plot_lack(lack: Lack, *, units: Mapping[str, str] | None = None, ax: Any = N
     rate = f"{unit}²" if unit.endswith(f"/{time}") else f"{unit or 1}/{time}"
     if ax is None:
         ax = plt.figure(figsize=(5, 3), layout="constrained").subplots()
-    half = half_width(0.95) * lack.sd
+    half = checked_half_width(0.95) * lack.sd
     ax.plot(lack.at, lack.residual, **{**DOTS, "ms": 3, "color": "0.7"}, label="each step")
     ax.axhline(0.0, color=GREY, lw=1, ls="--")
     bars: dict[str, Any] = {"color": BLUE, "fmt": "o-", "ms": 4, "lw": 1.3, "capsize": 2}

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gpadjust.dynamics.plots import going_on, labels
+from gpadjust.checks import checked_half_width
+from gpadjust.dynamics.plots import going_on, labels, plot_free_run
 from gpadjust.physics import PhysicsParameters
 from gpadjust.records import Identification
 from gpadjust.records.identification import GUESSES, IDENTIFIED, PERSISTENCE
-from gpadjust.records.plots import plot_identification, plot_lack
+from gpadjust.records.plots import plot_lack
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Card, Markup, Page, drawn, table, tag
 from gpadjust.report.subject import Origin
 from gpadjust.validation.plots import band, tidy
-from gpadjust.validation.trust import half_width
 from gpadjust.words import listed, number, percent, plural
 
 _NAMES = {
@@ -183,12 +183,15 @@ def _noise(machine: Identification, units: Mapping[str, str]) -> Markup:
 @drawn
 def _runs(machine: Identification, units: Mapping[str, str]) -> list[Markup]:
     """Return the free runs of each state along a few windows."""
+    others = {**machine.runs}
+    run = others.pop(IDENTIFIED)
     images = []
     for state in machine.spec.states:
-        for row in range(min(_WINDOWS, len(machine.windows.measured))):
+        for row in range(min(_WINDOWS, len(run.mean))):
             figure = html.new_figure(_HEIGHT)
-            options: dict[str, Any] = {"units": units, "axes": [[figure.subplots()]]}
-            plot_identification(machine, rows=[row], states=[state], **options)
+            options: dict[str, Any] = {"others": others, "step": machine.step, "units": units}
+            options |= {"rows": [row], "states": [state], "axes": [[figure.subplots()]]}
+            plot_free_run(run, machine.windows, **options)
             alt = f"free run of {state} with intervals, and measurements"
             images.append(html.image(figure, alt))
     return images
@@ -207,7 +210,7 @@ def _states(machine: Identification, units: Mapping[str, str]) -> list[Markup]:
         figure = html.new_figure(_HEIGHT)
         ax = figure.subplots()
         path = going_on(record.states[:, i], i in spec.angle_columns)  # angles without jumps
-        half = half_width(0.95) * sd[:, i]  # 1.96 sigma
+        half = checked_half_width(0.95) * sd[:, i]  # 1.96 sigma
         band(ax, record.times, (path, path - half, path + half), 0.95)
         ax.set(xlabel=axis_labels["time"], ylabel=axis_labels[state])
         tidy(ax)

@@ -36,6 +36,7 @@ from torch import Tensor
 from gpadjust.checks import (
     check_level,
     checked_bounds,
+    checked_half_width,
     checked_points,
     checked_tensor,
     checked_whole,
@@ -47,7 +48,7 @@ from gpadjust.physics.unknown import Curve
 from gpadjust.validation.comparison import Comparison
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.scores import Scores
-from gpadjust.validation.trust import SIDES, Trust, half_width, physics_at
+from gpadjust.validation.trust import SIDES, Trust, physics_at
 from gpadjust.validation.verdict import ALONE, CALIBRATED, name_of
 from gpadjust.words import labelled
 
@@ -227,7 +228,7 @@ def plot_leave_one_out(
         raise TypeError(
             f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
         )
-    z = half_width(level)
+    z = checked_half_width(level)
     mean = column(loo.mean, output)
     residuals = column(loo.residuals, output)
     axes = axes_of(axes, 1, 2)[0]
@@ -319,7 +320,7 @@ def _plot_curve(ax: Axes, curve: Curve, unknown: Unknown) -> None:
     draws = curve(x)
     ends = draws.quantile(draws.new_tensor([0.025, 0.975]), dim=0)
     band(ax, x, [draws.mean(0), *ends], 0.95)
-    half = half_width(0.95)
+    half = checked_half_width(0.95)
     for end in unknown.value(torch.tensor([-half, half]).double()).tolist():
         ax.axhline(end, color=GREY, ls=":", lw=1.0)
 
