@@ -125,6 +125,8 @@ def test_the_smoother_is_the_conditional_distribution_of_all_states(chain):
                 expected.append(added**2 + np.diag(spread)[:2])
             row += 3
     np.testing.assert_allclose(expected_squares(chain[0], smoothed, 2)[1], expected, atol=1e-8)
+    path = np.concatenate(draw_paths(smoothed, 1, np.random.default_rng(0)))
+    assert np.ptp(path[:, 2]) == 0  # one constant in all stretches
 
 
 def test_a_long_chain_is_computed_in_blocks_side_by_side(monkeypatch):
