@@ -15,6 +15,7 @@ from contextlib import contextmanager, nullcontext
 from numbers import Real
 from operator import index
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,12 @@ def check_level(level: float) -> None:
         raise TypeError(f"level must be a number such as 0.95; found {level!r}.")
     if not 0 < level < 1:
         raise ValueError(f"level must be between 0 and 1; found {level}; 95 % is 0.95.")
+
+
+def checked_half_width(level: float) -> float:
+    """Return half the width of a central interval of a level, in standard deviations."""
+    check_level(level)
+    return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def check_switch(name: str, value: Any) -> None:

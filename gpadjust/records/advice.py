@@ -26,7 +26,6 @@ _MOVES = 0.01  # of a state's changes in a step: process noise that matters
 _TOGETHER = 0.95  # a correlation of two parameters, in logarithms
 _CLEARER = 0.15  # of the least standard deviation of the two: that of their combination
 _POWERS = ((1, -1), (1, 1), (1, -2), (1, 2), (2, -1), (2, 1))
-_ENDS = torch.tensor([0.025, 0.5, 0.975])
 
 
 def on_log(records: Records, step: float) -> list[str]:
@@ -169,9 +168,9 @@ class Combination(NamedTuple):
 
     def __str__(self) -> str:
         """Return a sentence on the value by the log."""
-        low, mid, high = self.draws.quantile(_ENDS.to(self.draws)).tolist()
+        low, middle, high = self._ends
         return (
-            f"The log tells {self.name}, {mid:.4g} [{low:.4g}, {high:.4g}], and hardly "
+            f"The log tells {self.name}, {middle:.4g} [{low:.4g}, {high:.4g}], and hardly "
             f"{self.first} and {self.second} each. Measure one of them, and the other follows."
         )
 
@@ -181,9 +180,14 @@ class Combination(NamedTuple):
     @property
     def row(self) -> tuple[str, str, str, str]:
         """Name, median, central interval of 95 % and unit."""
-        low, mid, high = self.draws.quantile(_ENDS.to(self.draws)).tolist()
-        interval = f"{number(low, 4)} to {number(high, 4)}"
-        return self.name, number(mid, 4), interval, self.unit
+        low, middle, high = (number(end, 4) for end in self._ends)
+        return self.name, middle, f"{low} to {high}", self.unit
+
+    @property
+    def _ends(self) -> list[float]:
+        """The ends of the central 95 %, and the median between them."""
+        ends: list[float] = self.draws.quantile(self.draws.new_tensor([0.025, 0.5, 0.975])).tolist()
+        return ends
 
 
 class Combinations(list[Combination]):

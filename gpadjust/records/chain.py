@@ -45,6 +45,11 @@ class Estimate(NamedTuple):
     variances: Array  # of noise and process noise, 2 x d
     log_density: float  # of the measurements
 
+    def of_parameters(self, d: int) -> tuple[Array, Array]:
+        """Return mean and covariance of the parameters, which come after ``d`` states."""
+        means, covariances = self.stretches[0].states
+        return means[0, d:], covariances[0, d:, d:]
+
 
 class Path(NamedTuple):
     """States through all stretches, and the measurements, angles within half a turn of them."""

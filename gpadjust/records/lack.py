@@ -145,8 +145,7 @@ def robust_moments(chain: Chain, estimate: Estimate, step: float) -> tuple[Array
             added.append(search.added(i, size * columns @ root))
     d, p = chain.d, chain.num_parameters
     if not added:
-        moments = estimate.stretches[0].states
-        return moments.means[0, d:], moments.covariances[0, d:, d:]
+        return estimate.of_parameters(d)
     together = [np.concatenate(parts, -1) for parts in zip(*added, strict=True)]
     fit = search.fitted(search.links, chain.starts, together, 1.0)
     mean, covariance = (part[0] for part in fit.stretches[0].states)

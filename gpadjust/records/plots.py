@@ -12,12 +12,13 @@ from typing import Any
 import matplotlib.pyplot as plt
 import torch
 
+from gpadjust.checks import checked_half_width
 from gpadjust.dynamics.plots import going_on, labels, plot_free_run
 from gpadjust.records.identification import IDENTIFIED, Identification
 from gpadjust.records.lack import Lack
 from gpadjust.records.records import Record, Records
 from gpadjust.states import StateSpec
-from gpadjust.validation.plots import BLUE, DOTS, GREY, given_axes, legend, quantile, tidy
+from gpadjust.validation.plots import BLUE, DOTS, GREY, given_axes, legend, tidy
 
 __all__ = ["plot_identification", "plot_lack", "plot_record"]
 
@@ -111,7 +112,7 @@ def plot_lack(lack: Lack, *, units: Mapping[str, str] | None = None, ax: Any = N
     rate = f"{unit}²" if unit.endswith(f"/{time}") else f"{unit or 1}/{time}"
     if ax is None:
         ax = plt.figure(figsize=(5, 3), layout="constrained").subplots()
-    half = quantile(0.95) * lack.sd
+    half = checked_half_width(0.95) * lack.sd
     ax.plot(lack.at, lack.residual, **{**DOTS, "ms": 3, "color": "0.7"}, label="each step")
     ax.axhline(0.0, color=GREY, lw=1, ls="--")
     bars: dict[str, Any] = {"color": BLUE, "fmt": "o-", "ms": 4, "lw": 1.3, "capsize": 2}
@@ -125,5 +126,4 @@ def plot_lack(lack: Lack, *, units: Mapping[str, str] | None = None, ax: Any = N
         over = f"{lack.over}, {lack.lag:.2g} late, less {lack.over}"
     ax.set(xlabel=over, ylabel=f"{lack.state}' lacks, in {rate}")
     legend(ax)
-    tidy(ax)
     return ax

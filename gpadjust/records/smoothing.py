@@ -77,10 +77,8 @@ class SmoothedRecords:
 
         Parameters of sensors are ``x_gain``, ``x_offset`` and ``x_delay``, for a state x.
         """
-        moments = self.estimate.stretches[0].states
-        theta = slice(self.chain.d, None)
-        mean, covariance = moments.means[0, theta], moments.covariances[0, theta, theta]
-        return drawn_parameters(self.chain.unknowns, mean, covariance)
+        moments = self.estimate.of_parameters(self.chain.d)
+        return drawn_parameters(self.chain.unknowns, *moments)
 
     @property
     def physics_parameters(self) -> PhysicsParameters:
@@ -320,15 +318,13 @@ def _estimate(
 
 def _rival(chain: Chain, best: Estimate, ends: Sequence[Estimate]) -> Tensor | None:
     """Return parameters at the likeliest end that is apart from the best, and not unlikelier."""
-    theta = slice(chain.d, None)
-    moments = best.stretches[0].states
-    mean, covariance = moments.means[0, theta], moments.covariances[0, theta, theta]
+    mean, covariance = best.of_parameters(chain.d)
     for end in sorted(ends, key=lambda end: -end.log_density):
-        off = end.states[0, theta] - mean
+        off = end.states[0, chain.d :] - mean
         # (theta' - theta)' C^-1 (theta' - theta)
         square = off @ np.linalg.solve(covariance, off)
         if best.log_density - end.log_density < _LIKELY and square > _APART**2:
-            return chain.unknowns.to_values(torch.from_numpy(end.states[0, theta].copy()))
+            return chain.unknowns.to_values(torch.from_numpy(end.states[0, chain.d :].copy()))
     return None
 
 

@@ -26,8 +26,8 @@ from gpadjust.validation.plots import (
     tidy,
 )
 from gpadjust.validation.trust import SIDES
-from gpadjust.validation.verdict import has_one_sign
-from gpadjust.words import bare, labelled, name_and_unit, noted, number, percent, with_unit
+from gpadjust.validation.verdict import has_one_sign, named_point
+from gpadjust.words import labelled, name_and_unit, noted, number, percent, with_unit
 
 _CORRELATED = 0.7  # absolute correlation of parameters whose pair is drawn
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
@@ -46,8 +46,7 @@ def where_wrong(subject: Subject) -> Markup:
     inputs = inputs_drawn(subject)
     parts: list[Markup] = []
     if len(subject.inputs) > 1:
-        values = zip(subject.inputs, point(subject, subject.base, 3), strict=True)
-        pairs = [f"{bare(name)} = {with_unit(value, name)}" for name, value in values]
+        pairs = named_point(subject.inputs, subject.base, subject.levels)
         others = f"Along each input the others stay at the median of the data: {', '.join(pairs)}"
         if len(inputs) < len(pairs):
             few = f"drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most"
@@ -95,13 +94,6 @@ def inputs_drawn(subject: Subject) -> list[int]:
             mean = subject.model.predict(X).mean
             effects[-1] = float(((mean.amax(0) - mean.amin(0)) / spread).max())
     return sorted(sorted(range(len(effects)), key=lambda i: -effects[i])[:most])
-
-
-def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
-    """Return the inputs of a point, ``d``, in words: numbers, and the names of categories."""
-    levels = subject.levels
-    values = enumerate(X.tolist())
-    return [levels[i][int(x)] if i in levels else number(x, digits) for i, x in values]
 
 
 @drawn

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from gpadjust.checks import checked_half_width
 from gpadjust.dynamics.plots import going_on, labels, plot_free_run
 from gpadjust.physics import PhysicsParameters
 from gpadjust.records import Identification
@@ -13,7 +14,7 @@ from gpadjust.records.plots import plot_lack
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Card, Markup, Page, drawn, table, tag
 from gpadjust.report.subject import Origin
-from gpadjust.validation.plots import band, quantile, tidy
+from gpadjust.validation.plots import band, tidy
 from gpadjust.words import listed, number, percent, plural
 
 _NAMES = {
@@ -149,15 +150,9 @@ def _values(parameters: PhysicsParameters | None) -> list[str]:
 
 def _combinations(machine: Identification) -> Markup:
     """Return a table of combinations of parameters, each better known than its parameters."""
-    rows = []
-    for combination in machine.combinations:
-        draws = combination.draws
-        # the median and the ends of the central 95 %
-        low, middle, high = draws.quantile(draws.new_tensor([0.025, 0.5, 0.975]))
-        interval = f"{number(low, 4)} to {number(high, 4)}"
-        rows.append([combination.name, number(middle, 4), interval, combination.unit or "-"])
-    if not rows:
+    if not machine.combinations:
         return Markup()
+    rows = [[cell or "-" for cell in combination.row] for combination in machine.combinations]
     head = ["combination", "median", "95 % interval", "unit"]
     caption = "Combinations that the log determines"
     return html.join([table(caption, head, rows), tag("p", _COMBINED)])
@@ -215,7 +210,7 @@ def _states(machine: Identification, units: Mapping[str, str]) -> list[Markup]:
         figure = html.new_figure(_HEIGHT)
         ax = figure.subplots()
         path = going_on(record.states[:, i], i in spec.angle_columns)  # angles without jumps
-        half = quantile(0.95) * sd[:, i]  # 1.96 sigma
+        half = checked_half_width(0.95) * sd[:, i]  # 1.96 sigma
         band(ax, record.times, (path, path - half, path + half), 0.95)
         ax.set(xlabel=axis_labels["time"], ylabel=axis_labels[state])
         tidy(ax)

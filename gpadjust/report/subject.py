@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gpadjust.core import GP, StackedGP
 from gpadjust.kinds.ar1 import AR1
-from gpadjust.kinds.categories import Categories
+from gpadjust.kinds.categories import Categories, Levels
 from gpadjust.kinds.links import Link
 from gpadjust.physics import Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
@@ -56,7 +56,7 @@ class Subject:
     physics: dict[str, Physics]  # by their names
     has_physics: bool  # AR1 has its physics through samples alone
     base: Tensor  # medians of the inputs, d, for slices; of categories a level
-    levels: dict[int, tuple[str, ...]]  # names of categories, by column; their numbers are from 0
+    levels: Levels  # names of categories, by column; their numbers are from 0
     batches: list[int]  # columns of batches
 
     @property
@@ -107,7 +107,7 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
         raise ValueError(f"Expected {len(data.X)} names of rows, one for each, found {len(rows)}.")
     physics = {physics.name: physics for part in models for physics in part.physics}
     base = data.X.quantile(0.5, dim=0)
-    levels: dict[int, tuple[str, ...]] = {}
+    levels: Levels = {}
     batches: list[int] = []
     if isinstance(data.transform, Categories):
         batches = data.transform.batches

@@ -21,7 +21,7 @@ from gpadjust.report.inputs import imports_of
 from gpadjust.report.markup import Markup, join, table, tag
 from gpadjust.report.subject import Origin, Subject
 from gpadjust.validation.comparison import STACKED, cells_of, spread_of
-from gpadjust.validation.verdict import ALONE
+from gpadjust.validation.verdict import ALONE, point_in_words
 from gpadjust.words import bare, listed, name_and_unit, noted, number, percent, plural, with_unit
 
 _STRUCTURES = {
@@ -150,7 +150,7 @@ def _worst(subject: Subject, j: int) -> Markup:
         cells = [number(loo.Y[i, j], 4), number(loo.mean[i, j], 4), interval]
         cells.append(f"{loo.residuals[i, j]:+.1f}")
         if has_room:
-            cells += figures.point(subject, subject.X[i])
+            cells += point_in_words(subject.X[i], subject.levels, 4)
         row = subject.rows[i]
         if row in outliers:
             row = noted(row, "outlier")

@@ -22,7 +22,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from statistics import NormalDist
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +36,7 @@ from torch import Tensor
 from gpadjust.checks import (
     check_level,
     checked_bounds,
+    checked_half_width,
     checked_points,
     checked_tensor,
     checked_whole,
@@ -228,7 +228,7 @@ def plot_leave_one_out(
         raise TypeError(
             f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
         )
-    z = quantile(level)
+    z = checked_half_width(level)
     mean = column(loo.mean, output)
     residuals = column(loo.residuals, output)
     axes = axes_of(axes, 1, 2)[0]
@@ -320,7 +320,7 @@ def _plot_curve(ax: Axes, curve: Curve, unknown: Unknown) -> None:
     draws = curve(x)
     ends = draws.quantile(draws.new_tensor([0.025, 0.975]), dim=0)
     band(ax, x, [draws.mean(0), *ends], 0.95)
-    half = quantile(0.95)
+    half = checked_half_width(0.95)
     for end in unknown.value(torch.tensor([-half, half]).double()).tolist():
         ax.axhline(end, color=GREY, ls=":", lw=1.0)
 
@@ -535,12 +535,6 @@ def _symbol(name: str) -> str:
     if symbol not in ("rho", "delta"):
         return name
     return name_of(rf"$\{symbol}$", physics)
-
-
-def quantile(level: float) -> float:
-    """Return half the width of the central interval, in standard deviations."""
-    check_level(level)
-    return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def mean_and_ends(marginals: Marginals, output: int, level: float) -> tuple[Tensor, ...]:

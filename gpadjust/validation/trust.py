@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import Any
 
 import torch
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
-from gpadjust.checks import check_level
+from gpadjust.checks import checked_half_width
 from gpadjust.core.data import ArrayLike
 from gpadjust.core.model import Predictive
 from gpadjust.kinds.categories import on_levels
@@ -102,7 +101,7 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
         >>> bool(shares.data > 0.3), bool(shares.neither < 0.1)
         (True, True)
     """
-    check_level(level)
+    width = checked_half_width(level)
     if not isinstance(model, Predictive) or not getattr(model, "physics", None):
         raise TypeError(
             f"Expected a model with a physics to trust, such as CKA; found {type(model).__name__}. "
@@ -125,7 +124,7 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
     least = _NOTHING * _rms(data.Y - data.Y.nanmean(0))
     least = least.clamp_min(torch.finfo(least.dtype).tiny)
     # w = z sigma, z the quantile of the level
-    half = torch.maximum(NormalDist().inv_cdf((1 + level) / 2) * variance.sqrt(), least)
+    half = torch.maximum(width * variance.sqrt(), least)
     doubt = half / torch.maximum(discrepancy, least)
     return Trust(points, distance / half, doubt, data.input_names, data.output_names)
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.core import GP, FitResult
-from gpadjust.kinds.categories import levels_of, numbers_of, on_levels
+from gpadjust.kinds.categories import Levels, levels_of, numbers_of, on_levels
 from gpadjust.physics import PhysicsError
 from gpadjust.validation.faults import Fault, is_constant, rms
 from gpadjust.validation.trust import physics_at
@@ -351,14 +351,24 @@ def _at(model: GP, x: Tensor) -> str:
     names = model.data.input_names
     if len(names) > _NAMED:
         return ""
-    levels = levels_of(model)
-    places = []
-    for i, (name, value) in enumerate(zip(names, x.tolist(), strict=True)):
-        text = with_unit(number(value), name)
+    return f" at {listed(named_point(names, x, levels_of(model)))}"
+
+
+def named_point(names: Sequence[str], x: Tensor, levels: Levels) -> list[str]:
+    """Return the inputs of a point, ``d``, with their names and units, such as ``x = 0.5 m``."""
+    texts = zip(names, point_in_words(x, levels), strict=True)
+    return [f"{bare(name)} = {with_unit(text, name)}" for name, text in texts]
+
+
+def point_in_words(x: Tensor, levels: Levels, digits: int = 3) -> list[str]:
+    """Return the inputs of a point, ``d``, as numbers, and as names of categories by column."""
+    texts = []
+    for i, value in enumerate(x.tolist()):
+        text = number(value, digits)
         if i in levels:
             text = str(levels[i][numbers_of(levels[i]).index(value)])
-        places.append(f"{bare(name)} = {text}")
-    return f" at {listed(places)}"
+        texts.append(text)
+    return texts
 
 
 def unsampled(

@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 
 from gpadjust.physics import FunctionPhysics, Unknown
-from gpadjust.records import Record, Records, check_log
+from gpadjust.records import check_log
 from gpadjust.records.check import Direction
 from gpadjust.states import StateSpec
+from tests.records.machines import log_of
 
-STEP, ROWS = 0.1, 60
-SPEC = StateSpec(["x"], ["u"])
+ROWS = 60
+RANDOM = np.random.default_rng(1).uniform(-1, 1, ROWS)
 A, B = Unknown(0.9, sd=0.1), Unknown(0.5, sd=0.2)
 
 
-def log(actions, seed=0):
+def log(actions):
     """A measured state that decays, and is driven by actions."""
-    rng, x, states = np.random.default_rng(seed), 1.0, []
+    rng, x, states = np.random.default_rng(0), 1.0, []
     for u in actions:
-        states.append(x + 0.01 * rng.normal())
+        states.append([x])
         x = 0.9 * x + 0.5 * u
-    times = STEP * np.arange(len(actions))
-    return Records(Record(times, np.array(states)[:, None], actions[:, None]), SPEC)
+    return log_of(StateSpec(["x"], ["u"]), 0.1, np.array(states), actions, 0.01, rng)
 
 
 def test_a_list_of_directions_is_short():
@@ -36,28 +36,23 @@ def driven(X, p):
 
 
 def test_singular_values_are_those_of_free_runs():
-    actions = np.random.default_rng(1).uniform(-1, 1, ROWS)
-    records = log(actions)
+    records = log(RANDOM)
     measured = records.records[0].states[:, 0].numpy()
     variance = (np.diff(measured, 3) ** 2).mean() / 20
-
     # Along the measured states, as the first guess of a path is: x' = a x + b u + (x - x_t) dx'/dx
-    da, db, dfirst = np.zeros((3, ROWS))
-    dfirst[0] = 1
+    J = np.zeros((ROWS, 3))  # by a, b and the first state
+    J[0, 2] = 1
     for t in range(ROWS - 1):
-        da[t + 1] = 0.9 * da[t] + 0.1 * measured[t]
-        db[t + 1] = 0.9 * db[t] + 0.2 * actions[t]
-        dfirst[t + 1] = 0.9 * dfirst[t]
-    J = np.stack([da, db, dfirst], -1)
-    whole = J.T @ J / variance
+        J[t + 1] = 0.9 * J[t] + [0.1 * measured[t], 0.2 * RANDOM[t], 0]
+    information = J.T @ J / variance
     prior = 1 / (10 * measured.std()) ** 2
-    left = whole[:2, :2] - np.outer(whole[:2, 2], whole[2, :2]) / (whole[2, 2] + prior)
-    expected = np.sqrt(np.linalg.eigvalsh(left)[::-1])
-    found = check_log(records, FunctionPhysics(driven, unknowns={"a": A, "b": B}))
-    assert [each.value for each in found] == pytest.approx(expected.tolist(), rel=0.01)
-    for each in found:
-        assert math.hypot(*each.weights.values()) == pytest.approx(1)
-        assert "The log tells" in str(each)
+    shared = np.outer(information[:2, 2], information[2, :2]) / (information[2, 2] + prior)
+    expected = np.sqrt(np.linalg.eigvalsh(information[:2, :2] - shared)[::-1])
+    directions = check_log(records, FunctionPhysics(driven, unknowns={"a": A, "b": B}))
+    assert [direction.value for direction in directions] == pytest.approx(expected, rel=0.01)
+    for direction in directions:
+        assert math.hypot(*direction.weights.values()) == pytest.approx(1)
+        assert "The log tells" in str(direction)
 
 
 def test_what_no_action_moves_is_not_told_and_an_input_is_named():
@@ -74,7 +69,7 @@ def test_what_no_action_moves_is_not_told_and_an_input_is_named():
     assert str(last).startswith("The log cannot tell 1.00 b (singular value")
     assert "square wave of u between -1 and 1 with half a period of" in last.input
     calls.clear()
-    check_log(log(np.random.default_rng(1).uniform(-1, 1, ROWS)), physics)
+    check_log(log(RANDOM), physics)
     assert sum(calls) <= 10 * 2 * ROWS  # evaluations of f_p in all, for two parameters
 
 

@@ -5,65 +5,53 @@ from dataclasses import replace
 from html import unescape
 
 import matplotlib as mpl
+import numpy as np
 import pytest
 import torch
 
 from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
-from gpadjust.records import Record, Records, identify
+from gpadjust.records import identify
 from gpadjust.report import report
 from gpadjust.states import StateSpec
+from tests.records.machines import held, log_of, simulated
 
 mpl.use("Agg")
 pytestmark = pytest.mark.slow
-STEP, ROWS, FINE = 0.1, 300, 20
+STEP, ROWS = 0.1, 300
 SWING = StateSpec(["angle", "rate"], ["torque"], angles=["angle"], step=STEP)
 HEATED = StateSpec(["T"], ["heater"], step=STEP)
 FRICTION, TAU, INERTIA = 0.25, 0.6, 0.8
 
 
-def held_steps(generator):
-    """Actions that are held for eight steps, ``ROWS x 1``."""
-    numbers = torch.rand(ROWS // 8 + 1, 1, generator=generator, dtype=torch.float64)
-    return 4 * (numbers - 0.5).repeat_interleave(8, 0)[:ROWS]
-
-
-def record(states, actions, generator):
-    noisy = states + 0.01 * torch.randn(states.shape, generator=generator, dtype=torch.float64)
-    return Record(STEP * torch.arange(ROWS, dtype=torch.float64), noisy, actions)
-
-
 def swing(friction, unknowns=None, formula="-g*sin(angle) - c*rate + torque/J"):
     """A pendulum's log, of its angle alone, identified by equations without dry friction."""
-    generator = torch.Generator().manual_seed(0)
-    torques, states, a, v = held_steps(generator), [], 0.5, 0.0
-    for torque in torques[:, 0].tolist():
-        states.append([a, v])
-        for _ in range(FINE):
-            rate = -4 * math.sin(a) - 0.3 * v + torque / INERTIA
-            a += STEP / FINE * v
-            v += STEP / FINE * (rate - friction * math.tanh(v / 0.03))
-    own = record(torch.tensor(states, dtype=torch.float64), torques, generator)
-    own.states[:, 1] = math.nan
+
+    def motion(angle, rate, torque):
+        driven = -4 * math.sin(angle) - 0.3 * rate + torque / INERTIA
+        return rate, driven - friction * math.tanh(rate / 0.03)
+
+    rng = np.random.default_rng(0)
+    torques = held(rng, -2, 2, ROWS)
+    states = simulated(motion, [0.5, 0.0], torques, STEP)
     guesses = {"g": 3.0, "c": 0.2, "J": 1.0}
     unknowns = unknowns or {name: Unknown(x, factor=1.5) for name, x in guesses.items()}
     rates = FormulaPhysics(f"rate, {formula}", ["angle", "rate", "torque"], unknowns=unknowns)
-    start = {"rate": (0.0, 2.0)}
-    return identify(Records(own, SWING), ODEPhysics(rates, STEP, 2), start=start, num_starts=1)
+    log = log_of(SWING, STEP, states, torques, [0.01, math.nan], rng)
+    return identify(log, ODEPhysics(rates, STEP, 2), start={"rate": (0.0, 2.0)}, num_starts=1)
 
 
 def heated(has_lag):
     """The log of a temperature, behind a heater that may lag, identified without the lag."""
-    generator = torch.Generator().manual_seed(0)
-    heats, states, T, q = held_steps(generator), [], 0.0, 0.0
-    for heat in heats[:, 0].tolist():
-        states.append([T])
-        for _ in range(FINE):
-            q += STEP / FINE * (heat - q) / TAU
-            T += STEP / FINE * (2 * (q if has_lag else heat) - T) / 2
+
+    def flow(T, q, heat):
+        return (2 * (q if has_lag else heat) - T) / 2, (heat - q) / TAU
+
+    rng = np.random.default_rng(0)
+    heats = held(rng, -2, 2, ROWS)
+    states = simulated(flow, [0.0, 0.0], heats, STEP)
     unknowns = {"K": Unknown(1.5, factor=2.0), "tau": Unknown(1.0, factor=3.0)}
     rate = FormulaPhysics("(K*heater - T)/tau", ["T", "heater"], unknowns=unknowns)
-    own = record(torch.tensor(states, dtype=torch.float64), heats, generator)
-    return identify(Records(own, HEATED), ODEPhysics(rate, STEP, 1))
+    return identify(log_of(HEATED, STEP, states, heats, 0.01, rng), ODEPhysics(rate, STEP, 1))
 
 
 @pytest.fixture(scope="module")
@@ -112,17 +100,14 @@ def test_intervals_that_allow_for_a_missing_force_hold_the_damping(dry, right):
     assert right.robust_parameters.sd[1] < 0.1 * dry.robust_parameters.sd[1]
 
 
-def test_a_lag_is_found_with_what_to_do(lagging):
+def test_a_lag_is_found_with_what_to_do_and_is_no_yes(lagging):
     assert lagging.lack.over == "heater"
     assert 0.5 * TAU < lagging.lack.lag < 2 * TAU
-    told = " ".join(lagging.advice)
-    assert "T' lacks a lag: heater acts some" in told
-    assert "Try one state more" in told
-    assert "times the noise of its sensor: it stands for what the equations lack" in told
-
-
-def test_errors_with_a_cause_are_no_yes(lagging):
-    """Half of them were, by coverage alone."""
+    advice = " ".join(lagging.advice)
+    assert "T' lacks a lag: heater acts some" in advice
+    assert "Try one state more" in advice
+    assert "times the noise of its sensor: it stands for what the equations lack" in advice
+    # By coverage alone it would be one.
     answer, reasons = lagging.verdicts["T"]
     assert lagging.errors["identified"][0] > 2 * lagging.smoothed.noise[0]
     assert answer == "In part"
@@ -162,23 +147,17 @@ def test_better_than_the_guesses_by_chance_is_no_yes(right):
     answer, reasons = found.verdicts["angle"]
     assert answer == "In part"
     assert reasons[-1] == "Its error is less by chance than that of the guesses."
-    worse = replace(
-        right, runs={"identified": guessed._replace(mean=measured + 50.0), "guesses": run}
-    )
-    assert worse.verdicts["angle"][0] == "No"
+    far = guessed._replace(mean=measured + 50.0)
+    assert replace(right, runs={"identified": far, "guesses": run}).verdicts["angle"][0] == "No"
 
 
-def test_the_figure_of_a_residual(dry, lagging):
+def test_the_figure_of_a_residual_and_the_page_that_has_it(dry, lagging, tmp_path):
     ax = dry.lack.plot(units={"rate": "rad/s"})
-    assert ax.get_ylabel() == "rate' lacks, in rad/s²"
-    assert ax.get_xlabel() == "rate in rad/s"
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("rate in rad/s", "rate' lacks, in rad/s²")
     assert len(ax.lines[0].get_xdata()) == len(dry.lack.at)
     late = lagging.lack.plot()
     assert late.get_xlabel().startswith("heater, ")
     assert late.get_ylabel() == "T' lacks, in 1/s"
-
-
-def test_the_page_has_the_sentence_and_the_figure(dry, tmp_path):
     text = unescape(report(dry, tmp_path / "log.html").read_text(encoding="utf-8"))
     assert f"rate' lacks about {dry.lack.term}, as of dry friction" in text
     assert "residual of rate' over rate, and its means" in text

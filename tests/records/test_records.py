@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from gpadjust.dynamics import PhysicsDynamics, StateSpec, Trajectories
-from gpadjust.physics import ODEPhysics
 from gpadjust.records import Record, Records
+from tests.systems import uniform
 
 SPEC = StateSpec(["x"], ["u"])
 POINT = StateSpec(["x", "v"], ["u"])
@@ -25,31 +25,10 @@ def steps_of_episodes(data):
     return data.episode.unique_consecutive(return_counts=True)[1].tolist()
 
 
-def counted(num_rows, first=0.0, step=0.01, at=None, **options):
+def counted(num_rows, first=0.0, at=None, **options):
     """A record whose state is the number of its row from ``first``, and whose action its square."""
-    rows = first + torch.arange(num_rows, dtype=torch.float64)
-    times = step * rows if at is None else at
-    return Record(times, rows.unsqueeze(-1), rows.square().unsqueeze(-1), **options)
-
-
-def pendulum_record(num_rows=81, step=0.01):
-    """A pendulum that turns over, at times that a fine simulation meets, and its physics."""
-    physics = {
-        k: ODEPhysics(
-            lambda s, a: torch.stack([s[:, 1], a[:, 0] - 20 * s[:, 0].sin()], -1),
-            k * step,
-            2,
-            substeps=10 * k,
-        )
-        for k in (1, 5)
-    }
-    states, actions = [torch.tensor([[3.0, 2.0]]).double()], []
-    for k in range(num_rows):
-        actions.append(torch.full((1, 1), 3.0 + (k // 5) % 2).double())
-        states.append(physics[1](torch.cat([states[-1], actions[-1]], -1)))
-    path = torch.cat(states[:-1])
-    path[:, 0] = torch.atan2(path[:, 0].sin(), path[:, 0].cos())
-    return Record(step * np.arange(num_rows), path, torch.cat(actions)), physics[5]
+    rows = first + torch.arange(num_rows, dtype=torch.float64).unsqueeze(-1)
+    return Record(0.01 * rows[:, 0] if at is None else at, rows, rows.square(), **options)
 
 
 def test_a_control_step_is_every_kth_row_with_the_mean_action():
@@ -63,22 +42,13 @@ def test_a_control_step_is_every_kth_row_with_the_mean_action():
     assert every.states.flatten().tolist() == [*range(7)]
 
 
-def test_the_steps_of_a_system_are_those_of_its_physics():
-    record, physics = pendulum_record()
-    spec = StateSpec(["theta", "omega"], ["torque"], angles=["theta"])
-    data = Records([record], spec).trajectories(0.05)
-    assert len(data.states) == 16
-    assert record.states[:, 0].diff().abs().max() > 6, "it turns over"
-    windows = data.windows(16)
-    run = PhysicsDynamics(spec, physics).free_run(windows.initial_states, windows.actions)
-    assert run.score(windows.measured).rmse.max() < 1e-6
-
-
 def test_no_step_crosses_segments_gaps_or_records():
+    """The clock may start again in a segment."""
     segments = ["a"] * 12 + ["b"] * 13 + ["a"] * 6
+    clock = 0.01 * torch.cat([torch.arange(n) for n in (12, 13, 6)]).double()
     rows = torch.cat([torch.arange(11), torch.arange(13, 30)]).double()  # 11 and 12 are missing
     records = [
-        counted(31, segments=segments),
+        counted(31, segments=segments, at=clock),
         Record(0.01 * rows, rows.unsqueeze(-1), rows.unsqueeze(-1)),
         counted(14, first=70.0, name="late"),
     ]
@@ -87,12 +57,6 @@ def test_no_step_crosses_segments_gaps_or_records():
         lengths = [(n - 1) // k for n in (12, 13, 6, 11, 17, 14)]
         assert (data.next_states - data.states).unique().tolist() == [k]
         assert steps_of_episodes(data) == lengths
-
-
-def test_the_clock_may_start_anew_in_a_segment():
-    times = torch.cat([torch.arange(5), torch.arange(4)]).double()
-    record = counted(9, at=times, segments=torch.tensor([1] * 5 + [2] * 4))
-    assert Records([record], SPEC).trajectories().states.flatten().tolist() == [0, 1, 2, 3, 5, 6, 7]
 
 
 def test_rounded_times_are_even():
@@ -105,13 +69,10 @@ def test_rounded_times_are_even():
 
 def test_states_that_were_not_measured():
     nan = math.nan
-    states = torch.tensor(
-        [[0, 0], [1, 1], [2, nan], [3, 3], [nan, nan], [5, 5], [6, 6], [nan, nan]]
-    )
-    times, states = torch.arange(8).double(), states.double()
-    records = Records([Record(times, states, torch.zeros(8, 1).double())], POINT)
+    rows = [[0, 0], [1, 1], [2, nan], [3, 3], [nan, nan], [5, 5], [6, 6], [nan, nan]]
+    record = Record(torch.arange(8).double(), torch.tensor(rows).double(), column(*[0] * 8))
     with pytest.warns(UserWarning, match=r"Left out: 4 of 7 steps, 2 of which start at"):
-        data = records.trajectories()
+        data = Records(record, POINT).trajectories()
     assert data.states[:, 0].tolist() == [0, 1, 5]
     assert data.next_states[1].tolist() == pytest.approx([2, nan], nan_ok=True)
     assert steps_of_episodes(data) == [2, 1]
@@ -125,18 +86,16 @@ def test_stretches_that_are_too_short_are_left_out():
         assert records.trajectories(0.04).states.flatten().tolist() == [1]
 
 
-@pytest.mark.parametrize("names", [("x_1", "x_2", "u_1"), ("u_1", "x_2", "x_1")])
-@pytest.mark.parametrize("step", [0.01, 0.02])
-def test_previous_states_are_those_of_the_steps_before(names, step):
-    k = round(100 * step)
+@pytest.mark.parametrize(("names", "k"), [(("x_1", "x_2", "u_1"), 2), (("u_1", "x_2", "x_1"), 1)])
+def test_previous_states_are_those_of_the_steps_before(names, k):
     lags = {"x_1": "x", "x_2": "x_1", "u_1": "u"}
     spec = StateSpec([*names, "x"], ["u"], previous={name: lags[name] for name in names})
     record = counted(24, segments=["a"] * 13 + ["b"] * 11)
     never = torch.full((24, 3), math.nan, dtype=torch.float64)
     states = torch.cat([never, record.states], -1)
-    records = Records([Record(record.times, states, record.actions, record.segments)], spec)
+    records = Records(Record(record.times, states, record.actions, record.segments), spec)
     with pytest.warns(UserWarning, match="4 of which start at a state not measured in full"):
-        data = records.trajectories(step)
+        data = records.trajectories(0.01 * k)
     starts = [*range(2 * k, 13 - k, k), *range(13 + 2 * k, 24 - k, k)]
     assert data.states[:, 3].tolist() == starts
     pair = data.states, data.next_states
@@ -148,27 +107,21 @@ def test_previous_states_are_those_of_the_steps_before(names, step):
     assert torch.equal(after["x_2"], now["x_1"])
     assert torch.equal(after["u_1"], data.actions[:, 0])
     PhysicsDynamics(spec, lambda X: X[:, :1] + k).update(*data)  # as the spec says
-    assert records.windows(3, step).initial_states[0, 3] == 2 * k
+    assert records.windows(3, 0.01 * k).initial_states[0, 3] == 2 * k
     states[0, :3] = torch.tensor([-1.0, -2.0, -3.0])  # of the first row it is known
-    records = Records([Record(record.times, states, record.actions, record.segments)], spec)
+    records = Records(Record(record.times, states, record.actions, record.segments), spec)
     left = "2 of which start" if k == 1 else "4 of which start"  # of a row before, not of a step
     with pytest.warns(UserWarning, match=left):
-        data = records.trajectories(step)
+        data = records.trajectories(0.01 * k)
     assert data.states[0, 3] == (0 if k == 1 else 2 * k)
 
 
-def test_records_may_differ_in_their_sampling_steps():
-    records = Records(
-        [counted(9), counted(5, first=20, step=0.02, at=0.02 * torch.arange(5).double())], SPEC
-    )
-    assert records.trajectories(0.04).states.flatten().tolist() == [0, 4, 20, 22]
-
-
-def test_the_step_of_the_spec_is_the_default():
-    spec = StateSpec(["x", "v"], ["u"], integrated={"x": "v"}, step=0.02)
-    record = counted(9)
-    records = Records([Record(record.times, record.states.repeat(1, 2), record.actions)], spec)
-    assert records.trajectories().states[:, 0].tolist() == [0, 2, 4, 6]
+def test_records_may_differ_in_their_sampling_steps_and_the_step_of_the_spec_is_the_default():
+    slow = counted(5, first=20, at=0.02 * torch.arange(5).double())
+    records = [counted(9), slow]
+    assert Records(records, SPEC).trajectories(0.04).states.flatten().tolist() == [0, 4, 20, 22]
+    data = Records(records, StateSpec(["x"], ["u"], step=0.02)).trajectories()
+    assert data.states.flatten().tolist() == [0, 2, 4, 6, 20, 21, 22, 23]
 
 
 def test_windows_have_the_steps_of_transitions():
@@ -210,9 +163,8 @@ def test_dates_and_durations_are_seconds_since_the_first():
 
 
 def test_a_record_takes_tensors_arrays_and_frames():
-    frame = pd.DataFrame(
-        {"t": [0.0, 1, 2], "x": [1, 2, 3], "u": [4, 5, 6], "part": ["a", "a", "b"]}
-    )
+    columns = {"t": [0.0, 1, 2], "x": [1, 2, 3], "u": [4, 5, 6], "part": ["a", "a", "b"]}
+    frame = pd.DataFrame(columns)
     frames = frame["t"], frame[["x"]], frame[["u"]]
     arrays = [part.to_numpy(copy=True) for part in frames]
     tensors = [torch.tensor(part).double() for part in arrays]
@@ -228,55 +180,48 @@ def test_a_record_takes_tensors_arrays_and_frames():
             assert record.states[0] == 1, "it has data of its own"
 
 
-@pytest.fixture
-def csv(tmp_path):
-    """Writes a file and returns its path."""
-
-    def write(text, name="log.csv", encoding="utf-8"):
-        path = tmp_path / name
-        path.write_bytes(text.encode(encoding))
-        return path
-
-    return write
-
-
 NAMES = {"states": {"x": "q", "v": "dq"}, "actions": {"u": "tau"}}
 
 
-def test_csv_files_are_read_as_pandas_reads_them(csv, uniform):
-    frames = []
+def test_csv_files_are_read_as_pandas_reads_them(tmp_path):
+    expected = []
     for i in range(2):
         frame = pd.DataFrame(uniform(20, 3, seed=i).numpy(), columns=["q", "tau", "dq"])
         frame.insert(0, "time", 0.1 * np.arange(20))
         frame["spare"], frame["part"] = "text", ["one"] * 12 + ["two"] * 8
         frame.loc[3, "dq"] = math.nan
-        frames.append(frame)
-    files = [csv(frame.to_csv(index=False), f"{i}.csv") for i, frame in enumerate(frames)]
+        file = tmp_path / f"{i}.csv"
+        frame.to_csv(file, index=False)
+        columns = frame["time"], frame[["q", "dq"]], frame[["tau"]], frame["part"]
+        expected.append(Record(*columns, name=str(file)))
+    files = [record.name for record in expected]
     records = Records.read_csv(files, POINT, **NAMES, segment="part")
-    assert [record.name for record in records] == [*map(str, files)]
-    for record, frame in zip(records, frames, strict=True):
-        expected = Record(frame["time"], frame[["q", "dq"]], frame[["tau"]], frame["part"])
+    for record, other in zip(records, expected, strict=True):
+        assert (record.name, record.segments) == (other.name, other.segments)
         for name in ("times", "states", "actions"):
-            found, wanted = getattr(record, name), getattr(expected, name)
-            torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
-        assert record.segments == expected.segments
+            pair = getattr(record, name), getattr(other, name)
+            torch.testing.assert_close(*pair, rtol=0, atol=0, equal_nan=True)
 
 
-def test_csv_files_without_times_or_with_a_name_twice(csv):
+def test_csv_files_without_times_or_with_a_name_twice(tmp_path):
+    file = tmp_path / "log.csv"
     for text, options, end in (
         ("q,dq,tau\n1,2,3\n4,5,6\n", {"time": 0.5}, 0.5),
         ("x,q,x,dq,tau,time\na,1,a,2,3,0\na,4,a,5,6,1\n", {}, 1),
     ):
-        (record,) = Records.read_csv(csv(text), POINT, **NAMES, **options)
+        file.write_text(text)
+        (record,) = Records.read_csv(file, POINT, **NAMES, **options)
         assert record.times.tolist() == [0, end]
         assert record.states.tolist() == [[1, 2], [4, 5]]
         assert record.actions.tolist() == [[3], [6]]
 
 
-def test_columns_of_the_same_names_need_no_words_and_hidden_states_no_column(csv):
-    (record,) = Records.read_csv(str(csv("time,v,u,x\n0,1,2,\n1,4,5,nan\n")), POINT)
+def test_columns_of_the_same_names_need_no_words_and_hidden_states_no_column(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_text("time,v,u,x\n0,1,2,\n1,4,5,nan\n")
+    (record,) = Records.read_csv(str(file), POINT)
     assert record.states.tolist() == [[pytest.approx(math.nan, nan_ok=True), v] for v in (1, 4)]
-    file = csv("time,x,u\n0,1,2\n1,4,5\n")
+    file.write_text("time,x,u\n0,1,2\n1,4,5\n")
     (record,) = Records.read_csv(file, POINT, states={"v": None})
     assert record.states[:, 0].tolist() == [1, 4]
     assert record.states[:, 1].isnan().all()
@@ -289,18 +234,15 @@ def test_columns_of_the_same_names_need_no_words_and_hidden_states_no_column(csv
 
 
 def test_windows_are_drawn_evenly_and_are_records_again():
-    record = counted(40)
-    windows = Records([record], SPEC).windows(3, 0.01)
+    windows = Records(counted(40), SPEC).windows(3, 0.01)
     drawn = windows.spread(4, seed=1)
     assert drawn.states.shape == (4, 4, 1)
     numbers = (drawn.states[:, 0, 0] / 3).tolist()  # of 13, one of each of four parts
     ends = pairwise((0, 3, 6, 9, 13))
     assert all(low <= i < high for i, (low, high) in zip(numbers, ends, strict=True))
     assert torch.equal(windows.spread(4, seed=1).states, drawn.states)
-    again = Records.of_windows(drawn, SPEC, 0.01)
-    assert [len(each.times) for each in again] == [4] * 4
-    back = again.windows(3, 0.01)
-    for part, other in zip(back, drawn, strict=True):
+    again = Records.of_windows(drawn, SPEC, 0.01).windows(3, 0.01)
+    for part, other in zip(again, drawn, strict=True):
         assert torch.equal(part, other)
     with pytest.raises(ValueError, match=r"number <= 13, .* got 14"):
         windows.spread(14)

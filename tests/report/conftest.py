@@ -2,83 +2,56 @@
 
 import re
 import sys
-from html.parser import HTMLParser
+from xml.etree import ElementTree
 
 import pytest
-import torch
 
 from gpadjust.__main__ import main
 from gpadjust.report.markup import Markup
 from gpadjust.validation import compare
+from tests.systems import line, normal, wave
 
-VOID = {"meta", "img", "br"}
 
-
-class Page(HTMLParser):
-    """What is in a page: its text, tables, images, code, and attributes; its tags are balanced."""
+class Page:
+    """A page of balanced tags as a reader sees it: text, tables, images, code."""
 
     def __init__(self, html):
-        super().__init__()
-        self.open, self.pieces, self.tables, self.images = [], [], {}, []
-        self.codes, self.attributes, self.styles, self.ids = [], [], [], []
-        self.tags = set()
-        self.feed(html)
-        self.close()
-        assert self.open == []
-        self.text = " ".join(" ".join(self.pieces).split())
-
-    def handle_starttag(self, tag, attributes):
-        named = dict(attributes)
-        self.tags.add(tag)
-        self.attributes += [(tag, *pair) for pair in attributes]
-        self.ids += [named["id"]] if "id" in named else []
-        if tag == "img":
-            self.images.append(named)
-        if tag not in VOID:
-            self.open.append(tag)
-        if tag == "table":
-            self.rows = []
-        elif tag == "tr":
-            self.rows.append([])
-        elif tag in ("td", "th"):
-            self.rows[-1].append("")
-        elif tag == "caption":
-            self.caption = ""
-        elif tag == "code":
-            self.codes.append("")
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-        if tag == "table":
-            self.tables[self.caption] = self.rows
-
-    def handle_data(self, data):
-        if self.open[-1:] == ["style"]:
-            self.styles.append(data)
-            return
-        self.pieces.append(data)
-        if "code" in self.open:
-            self.codes[-1] += data
-        elif "caption" in self.open:
-            self.caption += data
-        elif {"td", "th"} & {*self.open}:
-            self.rows[-1][-1] += data
+        html = html.removeprefix("<!DOCTYPE html>")
+        closed = re.sub(r"<(meta|img)\b([^>]*)>", r"<\1\2/>", html)
+        self.root = ElementTree.fromstring(f"<page>{closed}</page>")
+        self.styles = [style.text for style in self.root.iter("style")]
+        for style in self.root.iter("style"):
+            style.text = ""
+        self.text = " ".join(" ".join(self.root.itertext()).split())
+        self.images = [image.attrib for image in self.root.iter("img")]
+        self.codes = [text_in(code) for code in self.root.iter("code")]
+        self.tables = {
+            text_in(table.find("caption")): [[*map(text_in, row)] for row in table.iter("tr")]
+            for table in self.root.iter("table")
+        }
 
     def needs_nothing_else(self):
         """Whether it refers to nothing but its own sections, and runs no script."""
-        links = [(tag, value) for tag, name, value in self.attributes if name in ("src", "href")]
-        own = all(
-            value.startswith("data:image/") if tag == "img" else value[1:] in self.ids
-            for tag, value in links
+        elements = [*self.root.iter()]
+        ids = {f"#{element.get('id')}" for element in elements}
+        names = {name for element in elements for name in element.attrib}
+        return (
+            all(image["src"].startswith("data:image/") for image in self.images)
+            and {element.get("href") for element in elements} - {None} <= ids
+            and all(element.tag == "img" or "src" not in element.attrib for element in elements)
+            and not any(name.startswith("on") for name in names)
+            and not {"script", "iframe", "link"} & {element.tag for element in elements}
+            and not re.search(r"url\(|@import", "".join(self.styles))
         )
-        has_events = any(name.startswith("on") for _, name, _ in self.attributes)
-        is_quiet = not has_events and not {"script", "iframe"} & self.tags
-        return own and is_quiet and not re.search(r"url\(|@import", "".join(self.styles))
 
     def loading_code(self):
         """The only code that loads a model."""
         (code,) = [text for text in self.codes if "load(" in text]
         return code
+
+
+def text_in(element):
+    return "".join(element.itertext())
 
 
 @pytest.fixture
@@ -92,8 +65,6 @@ def folder(tmp_path, monkeypatch):
     """The working directory, and modules of its own."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    for name in ("hill", "broken", "lacks", "swing"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
     yield tmp_path
     for name in ("hill", "broken", "lacks", "swing"):
         sys.modules.pop(name, None)
@@ -128,15 +99,9 @@ def undrawn(monkeypatch):
         monkeypatch.setattr(f"gpadjust.report.log_page.{name}", lambda *args: Markup())
 
 
-def f_p(X):
-    return torch.sin(6 * X[:, :1])
-
-
 @pytest.fixture(scope="session")
 def comparison():
     """Of ten noisy points of a wave."""
-    generator = torch.Generator().manual_seed(0)
-    X = torch.linspace(0, 1, 10, dtype=torch.float64).unsqueeze(-1)
-    Y = 2 * f_p(X) + X + 0.1 * torch.randn(10, 1, generator=generator, dtype=torch.float64)
-    structures = ["zero mean", "physics mean", "CKA"]
-    return compare(X, Y, f_p, structures=structures)
+    X = line(10)
+    Y = 2 * wave(X) + X + 0.1 * normal(10, 1)
+    return compare(X, Y, wave, structures=["zero mean", "physics mean", "CKA"])

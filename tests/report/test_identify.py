@@ -10,17 +10,17 @@ import torch
 
 from gpadjust.__main__ import main
 from gpadjust.physics import Unknown
-from gpadjust.records import Identification, Records, identify
+from gpadjust.records import Identification, Records
 from gpadjust.report import log_page, report
-from gpadjust.report.inputs import unknown_of
 from gpadjust.report.subject import Origin
+from tests.records.test_identification import SPEC, oscillation, quickly, spring
 
 from .conftest import Page
 
-LOG = Path(__file__).parents[2] / "examples" / "swing.csv"
+HEAD, *SAMPLES = (Path(__file__).parents[2] / "examples" / "swing.csv").read_text().splitlines()
+LOG = "\n".join([HEAD, *SAMPLES[::5], ""])  # every 0.05 s
 TRUE = {"l": 0.6, "c": 0.15, "J": 0.4, "F": 0.1}  # of the simulation
 NOISE = 0.5 * torch.pi / 180  # rad
-GRAVITY = "rate' = -9.81/l*sin(angle) - c*rate + "
 PRIORS = ("l [m] = 0.5 */ 1.5", "c [1/s] = 0.1 */ 2", "J [kg m2] = 0.3 */ 1.5")
 QUICKLY = ("--step", "0.1", "--starts", "1")
 STATES = ("--states", "angle,rate", "--hidden", "rate [rad/s] = 0 +- 3", "--actions", "torque")
@@ -34,20 +34,21 @@ def fails(X): raise RuntimeError("no such angle")
 """
 
 
-def options(*equations, unknowns=PRIORS):
-    parts = [("--physics", each) for each in ("angle' = rate", *equations)]
-    parts += [("--unknown", each) for each in unknowns]
+def options(law, *unknowns):
+    equations = ("angle' = rate", f"rate' = -9.81/l*sin(angle) - c*rate + {law}")
+    parts = [("--physics", equation) for equation in equations]
+    parts += [("--unknown", prior) for prior in (*PRIORS, *unknowns)]
     return [word for part in parts for word in part]
 
 
-VISCOUS = options(GRAVITY + "torque/J")
-DRY = options(GRAVITY + "(torque - F*tanh(rate/0.05))/J", unknowns=(*PRIORS, "F [N m] = 0.05 */ 3"))
+VISCOUS = options("torque/J")
+DRY = options("(torque - F*tanh(rate/0.05))/J", "F [N m] = 0.05 */ 3")
 
 
 @pytest.fixture
 def folder(folder):
     """The working directory: the log, a module, and an earlier page."""
-    (folder / "log.csv").write_text(LOG.read_text())
+    (folder / "log.csv").write_text(LOG)
     (folder / "swing.py").write_text(MODULE)
     (folder / "identify.html").write_text("earlier")
     return folder
@@ -58,15 +59,15 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
     assert main(["identify", "log.csv", *STATES, *DRY, *QUICKLY]) == 0
     out, err = capsys.readouterr()
     assert "Wrote identify.html." in out
-    assert "1201 rows every 0.01" in err
+    assert "241 rows every 0.05" in err
     page = read(folder / "identify.html")
     assert page.needs_nothing_else()
-    for name, _, _, interval, _, unit in page.tables["Parameters by the fitted part of the log"][
-        1:
-    ]:
+    units = {"l": "m", "c": "1/s", "J": "kg m2", "F": "N m"}
+    rows = page.tables["Parameters by the fitted part of the log"][1:]
+    for name, _, _, interval, _, unit in rows:
         low, high = map(float, interval.split(" to "))
         assert low < TRUE[name] < high < 3 * low
-        assert unit == {"l": "m", "c": "1/s", "J": "kg m2", "F": "N m"}[name]
+        assert unit == units[name]
     noises = {row[0]: row[1:] for row in page.tables["Noise"][1:]}
     assert float(noises["angle"][0]) == pytest.approx(NOISE, rel=0.2)
     assert noises["rate"][0::2] == ["hidden", "rad/s"]
@@ -82,45 +83,42 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
         "Measure one of them, and the other follows\\."
     )
     assert re.fullmatch(told, advice.strip())
-    assert [each["alt"].partition(",")[0] for each in page.images] == [
-        "free run of angle with intervals",
-        "free run of rate with intervals",
-        "angle",
-        "rate",
-    ]
+    runs = [f"free run of {state} with intervals" for state in ("angle", "rate")]
+    alts = [image["alt"].partition(",")[0] for image in page.images]
+    assert alts == [*runs, "angle", "rate"]
     (program,) = page.codes
     names = {}
     exec(program, names)
     assert f"{float(names['machine'].errors['identified'][0]):.3g}" == errors["identified"][0]
     assert names["run"].mean.shape == (1, 100, 2)
-    assert {each.name for each in folder.iterdir()} == {*("log.csv", "swing.py", "identify.html")}
+    assert {file.name for file in folder.iterdir()} == {"log.csv", "swing.py", "identify.html"}
 
 
 @pytest.mark.slow
-def test_missing_friction_and_a_physics_of_a_module(folder, read, undrawn, capsys):
-    """Without dry friction the viscous one is wrong, and so are the intervals."""
-    quickly = ["--step", "0.05", "--starts", "1", "--title", "A swing"]
+def test_missing_friction(folder, read, undrawn, capsys):
+    """The damping stands for it, and intervals are too narrow."""
+    quickly = [*QUICKLY, "--title", "A swing"]
     assert main(["identify", "log.csv", *STATES, *VISCOUS, *quickly]) == 0
     page = read(folder / "identify.html")
-    assert "180 steps of 0.05 s, 60 steps held out" in page.text
     assert page.text.startswith("A swing")
-    assert "the physics lacks something whose errors last longer" in page.text
-    # By half of the measurements 90 % are covered, and the answer is Yes: of predictions alone, as
-    # process noise stands for the friction. The viscous one is as wrong, and the advice has it.
-    assert main(["identify", "log.csv", *STATES, *VISCOUS, *QUICKLY]) == 0
-    page = read(folder / "identify.html")
-    assert capsys.readouterr().out.rpartition("angle: ")[2].startswith("Yes.")
+    assert capsys.readouterr().out.rpartition("angle: ")[2].startswith("In part.")
     errors = {row[0]: row[2:] for row in page.tables["Errors of the free run"][1:]}
     error, _, covered = errors["identified"]
-    assert covered == "90 %"
+    assert covered == "87 %"
     assert float(error) > 1.8 * NOISE
     rows = {row[0]: row for row in page.tables["Parameters by the fitted part of the log"][1:]}
     low, high = map(float, rows["c"][3].split(" to "))
     assert not low < TRUE["c"] < high
     assert "Dry friction, for one, is hard to tell from damping" in page.text
-    options = ["--physics", "swing:physics", "--starts", "1", "--out", "module.html"]
-    assert main(["identify", "log.csv", *STATES, *options]) == 0
-    page = read(folder / "module.html")
+    assert "the physics lacks something whose errors last longer" in page.text
+
+
+@pytest.mark.slow
+def test_a_physics_of_a_module(folder, read, undrawn):
+    physics = ["--physics", "swing:physics", "--starts", "1"]
+    assert main(["identify", "log.csv", *STATES, *physics]) == 0
+    page = read(folder / "identify.html")
+    assert "90 steps of 0.1 s, 30 steps held out" in page.text
     assert dict(page.tables["How this page came about"])["step"] == "0.1 s"
     assert "physics = swing.physics" in page.codes[0]
 
@@ -129,39 +127,36 @@ def test_without_actions_there_is_the_time_and_next_values_are_equations_too(
     folder, undrawn, capsys
 ):
     rows = "".join(f"{k},{k / 2},{5 * 0.9**k}\n" for k in range(24))
-    (folder / "cooling.csv").write_text(f"n,t [s],excess [K]\n{rows}")
-    given = ["--time", "t", "--states", "T=excess", "--physics", "T = q * T + 0 * time"]
-    assert main(["identify", "cooling.csv", *given, "--unknown", "q [1/s] = 0.5 .. 1"]) == 0
+    (folder / "log.csv").write_text(f"n,t [s],excess [K]\n{rows}")
+    states = ["--time", "t", "--states", "T=excess"]
+    physics = ["--physics", "T = q * T + 0 * time", "--unknown", "q [1/s] = 0.5 .. 1"]
+    assert main(["identify", "log.csv", *states, *physics]) == 0
     first, *_, value, wrote = capsys.readouterr().out.splitlines()
     assert first.startswith("T: Yes. Errors of the free run, your equations with the guesses: ")
-    assert value == "q = 0.9 (0.9 to 0.9) 1/s"
-    assert wrote == "Wrote identify.html."
+    assert (value, wrote) == ("q = 0.9 (0.9 to 0.9) 1/s", "Wrote identify.html.")
     text = (folder / "identify.html").read_text()
     assert "0.9 to 0.9" in text
     assert "ODEPhysics" not in text
 
 
+@pytest.fixture(scope="module")
+def machine():
+    return quickly(Records(oscillation(80), SPEC), spring(Unknown(1.5, factor=1.5)))
+
+
 @pytest.mark.parametrize("program", ["machine = identify(records, physics)", ""])
-def test_what_the_command_does_not_offer_is_in_python(program, monkeypatch, undrawn):
-    from tests.records.test_identification import SPEC, oscillation, quickly, spring
-
-    found = quickly(Records(oscillation(80), SPEC), spring(Unknown(1.5, factor=1.5)))
+def test_what_the_command_does_not_offer_is_in_python(machine, program, monkeypatch, undrawn):
     sentence = "Fitted to free runs (`by_free_runs=True`) the physics has a smaller error."
-    advice = property(lambda machine: [sentence])
-    monkeypatch.setattr(Identification, "advice", advice)
-    text = Page(log_page.page(found, None, Origin(program=program)).sections["Advice"]).text
-    way_out = "to identify in the program below, in Python." if program else sentence
+    monkeypatch.setattr(Identification, "advice", property(lambda machine: [sentence]))
+    text = Page(log_page.page(machine, None, Origin(program=program)).sections["Advice"]).text
     assert text.startswith(sentence)
-    assert text.endswith(way_out)
+    assert text.endswith("identify in the program below, in Python." if program else sentence)
 
 
-def test_guesses_that_diverge_are_beaten_and_have_no_number(folder, read, undrawn):
-    from tests.records.test_identification import SPEC, oscillation, quickly, spring
-
-    found = quickly(Records(oscillation(80), SPEC), spring(Unknown(1.5, factor=1.5)))
-    guesses = found.runs["guesses"]
+def test_guesses_that_diverge_are_beaten_and_have_no_number(machine, folder, read, undrawn):
+    guesses = machine.runs["guesses"]
     diverging = guesses._replace(mean=torch.full_like(guesses.mean, 1e200))
-    found = replace(found, runs={**found.runs, "guesses": diverging})
+    found = replace(machine, runs={**machine.runs, "guesses": diverging})
     assert found.errors["guesses"][0].isinf()
     answer, reasons = found.verdicts["x"]
     assert (answer, len(reasons)) == ("Yes", 1)
@@ -172,13 +167,10 @@ def test_guesses_that_diverge_are_beaten_and_have_no_number(folder, read, undraw
 
 @pytest.mark.slow
 def test_python_makes_the_same_page_of_an_identification(folder, read, undrawn):
-    from tests.records.test_identification import SPEC, START, oscillation, spring
-
-    found = identify(Records(oscillation(40), SPEC), spring(), start=START)
+    found = quickly(Records(oscillation(40), SPEC), spring())
     with pytest.raises(TypeError, match="leave `rows` out"):
         report(found, folder / "own.html", rows=["first"])
-    path = report(found, folder / "own.html", settings={"day": "Monday"})
-    page = read(path)
+    page = read(report(found, folder / "own.html", settings={"day": "Monday"}))
     assert ["day", "Monday"] in page.tables["How this page came about"]
     assert "Parameters of the physics" not in page.text
     assert not page.codes
@@ -200,6 +192,7 @@ REFUSED = [
     option("--physics", "swing:physics", "Expected swing:physics alone"),
     option("--physics", "x' = rate", "each of angle, rate.* equations for angle, rate, x"),
     option("--held-out", "0.8", "at most 0.5"),
+    (["identify", "log.csv", "--states", "pi=angle", "--physics", "pi_' = pi"], "'pi' of your own"),
     option("--step", "0.013", "whole multiple of the sampling step"),
     (
         ["identify", "log.csv", *STATES, "--physics", "swing:fails", "--step", "0.05"],
@@ -212,7 +205,7 @@ LOGS = {
     "time,angle,torque\n0,1,0\n1,x,0\n": r"column 2 \('angle'\): expected a number, or nothing",
     "Zeit,angle,torque\n0,1,0\n1,1,0\n2,1,0\n": "column 'time', .*Other times: --time Zeit",
     "time,angle,torque\n0,1,0\n1,1,0\n2,1,0\n": "8 control steps or more",
-    LOG.read_text().replace("[rad]", "[deg]", 1): "the angle 'angle' in rad, found 'deg'",
+    LOG.replace("[rad]", "[deg]", 1): "the angle 'angle' in rad, found 'deg'",
 }
 
 
@@ -223,33 +216,20 @@ def test_refused(folder, fails):
         (folder / "log.csv").write_text(text)
         angles = ["--angles", "angle"] * ("[deg]" in text)
         fails(["identify", "log.csv", *STATES, *VISCOUS, *angles], words)
-
-
-def test_the_log_is_never_overwritten(folder, fails):
-    (folder / "log.html").write_text(LOG.read_text())
+    (folder / "log.html").write_text(LOG)  # is never overwritten
     command = ["identify", "log.html", *STATES, *VISCOUS, "--out", "log.html"]
     fails(command, "log.html is the data")
 
 
-def test_a_column_pi_is_never_the_constant(folder, fails):
-    rows = "".join(f"{k},{k / 2},{5 * 0.9**k},{k}\n" for k in range(24))
-    (folder / "log.csv").write_text(f"n,time,T,pi\n{rows}")
-    given = ["identify", "log.csv", "--states", "T", "--unknown", "q = 0.5 .. 1"]
-    words = "formulas take it as 3.14159, and here is a 'pi' of your own"
-    for more in ([], ["--actions", "pi"]):
-        fails([*given, *more, "--physics", "T = q*T + 0*pi"], words)
-    fails([*given, "--physics", "pi = T"], "an equation for each of T")
-
-
 def test_a_log_with_dates_other_names_and_units_in_round_brackets(folder, read, capsys, undrawn):
-    time = [f"{13 + k // 60}:{k % 60:02}" for k in range(0, 96, 4)]
-    speeds = [f"{1000 * 0.9**k:.6f}".replace(".", ",") for k in range(24)]
-    rows = [f"13.02.2015 {t};{speed}" for t, speed in zip(time, speeds, strict=True)]
-    text = "\n".join(["Datum;Motor Optical Speed (RPM)", *rows, ""])
-    (folder / "log.csv").write_text(text)
-    given = ["--time-unit", "h", "--states", "in=Motor Optical Speed"]  # dates are the time
-    command = ["identify", "log.csv", *given, "--physics", "in' = -lambda * in"]
-    assert main([*command, "--unknown", "lambda [1/h] = 1 */ 3"]) == 0
+    rows = []
+    for k in range(24):
+        speed = f"{1000 * 0.9**k:.6f}".replace(".", ",")
+        rows.append(f"13.02.2015 {13 + k // 15}:{4 * k % 60:02};{speed}")
+    (folder / "log.csv").write_text("\n".join(["Datum;Motor Optical Speed (RPM)", *rows, ""]))
+    states = ["--time-unit", "h", "--states", "in=Motor Optical Speed"]  # dates are the time
+    physics = ["--physics", "in' = -lambda * in", "--unknown", "lambda [1/h] = 1 */ 3"]
+    assert main(["identify", "log.csv", *states, *physics]) == 0
     page = read(folder / "identify.html")
     assert "the times are in its only column of dates, 'Datum'." in capsys.readouterr().err
     (row,) = page.tables["Parameters by the fitted part of the log"][1:]
@@ -272,8 +252,3 @@ def test_actions_within_a_step_are_followed(folder, undrawn, capsys):
     given += ["--physics", "x' = u - c*x", "--unknown"]
     assert main([*given, "c [1/s] = 1 */ 3"]) == 0
     assert "c = 2 (2 to 2) 1/s" in capsys.readouterr().out
-
-
-def test_a_parameter_may_be_a_function():
-    function = Unknown(1.0, factor=3.0, unit="1/s", function_of="x", between=(0.0, 2.0))
-    assert unknown_of("c(x: 0 .. 2) [1/s] = 1 */ 3") == ("c", function)

@@ -17,6 +17,7 @@ from gpadjust.validation.plots import (
     plot_model,
     plot_prediction,
 )
+from tests import systems
 from tests.systems import crude
 
 mpl.use("Agg")
@@ -44,17 +45,20 @@ def _leave_pyplot_alone():
 
 
 def curve(ax, label):
-    (found,) = [line for line in ax.lines if line.get_label() == label]
-    return found
+    (line,) = [line for line in ax.lines if line.get_label() == label]
+    return line
 
 
-def band(ax):
-    """Lower and upper edge of the first band at each x."""
+def is_drawn(ax, label, y):
+    """Asserts that a curve has these values ``n x 1``."""
+    np.testing.assert_allclose(curve(ax, label).get_ydata(), y.detach()[:, 0], atol=1e-9)
+
+
+def band(ax, x):
+    """Lower and upper edge of the first band at a position."""
     vertices = ax.collections[0].get_paths()[0].vertices
-    return {
-        x: (vertices[vertices[:, 0] == x, 1].min(), vertices[vertices[:, 0] == x, 1].max())
-        for x in np.unique(vertices[:, 0])
-    }
+    edges = vertices[vertices[:, 0] == float(x), 1]
+    return [edges.min(), edges.max()]
 
 
 @pytest.mark.slow
@@ -64,25 +68,23 @@ def test_a_prediction_of_one_input(line, forrester):
     assert plt.gcf() is ax.figure
     x = forrester.test_X
     posterior = line.posterior(x)
-    mean, sd = posterior.mean.detach()[:, 0], posterior.variance.detach()[:, 0].sqrt()
-    np.testing.assert_allclose(curve(ax, "mean").get_xydata(), torch.stack([x[:, 0], mean], -1))
-    np.testing.assert_allclose(curve(ax, "truth").get_ydata(), forrester.truth(x)[:, 0])
-    np.testing.assert_allclose(curve(ax, "physics").get_ydata(), forrester.crude(x)[:, 0])
+    mean, sd = posterior.mean.detach(), posterior.variance.detach().sqrt()
+    np.testing.assert_allclose(curve(ax, "mean").get_xdata(), x[:, 0])
+    is_drawn(ax, "mean", mean)
+    is_drawn(ax, "truth", forrester.truth(x))
+    is_drawn(ax, "physics", forrester.crude(x))
     data = torch.cat(forrester.data(0), dim=-1)
     np.testing.assert_allclose(curve(ax, "data").get_xydata(), data, rtol=1e-10)
-    edges = band(ax)
     for i in (3, 17):
-        low, high = edges[x[i].item()]
-        assert low == pytest.approx((mean - Z95 * sd)[i].item())
-        assert high == pytest.approx((mean + Z95 * sd)[i].item())
+        ends = [(mean + sign * Z95 * sd)[i].item() for sign in (-1, 1)]
+        assert band(ax, x[i]) == pytest.approx(ends)
 
 
 def test_several_physics_behind_a_prediction(forrester):
     both = {"coarse": forrester.crude, "fine": forrester.truth}
     ax = plot_prediction(CKA(*forrester.data(0), physics=both), forrester.test_X)
     for name, f_p in both.items():
-        drawn = curve(ax, f"physics {name}").get_ydata()
-        np.testing.assert_allclose(drawn, f_p(forrester.test_X)[:, 0])
+        is_drawn(ax, f"physics {name}", f_p(forrester.test_X))
 
 
 def test_a_prediction_within_bounds(forrester):
@@ -90,9 +92,8 @@ def test_a_prediction_within_bounds(forrester):
     model = LinkedCKA(X, Y.exp(), physics=lambda X: forrester.crude(X).exp())
     ax = plot_model(model)[0, 0]
     x = torch.as_tensor(curve(ax, "mean").get_xdata()).unsqueeze(-1)
-    np.testing.assert_allclose(curve(ax, "mean").get_ydata(), model.predict(x).mean.detach()[:, 0])
-    drawn = curve(ax, "physics").get_ydata()
-    np.testing.assert_allclose(drawn, forrester.crude(x).exp()[:, 0])
+    is_drawn(ax, "mean", model.predict(x).mean)
+    is_drawn(ax, "physics", forrester.crude(x).exp())
 
 
 def test_adjustments_are_slices_through_the_base_point(plane):
@@ -133,19 +134,28 @@ def test_coverage(plane, data):
             assert y[np.searchsorted(x, level, side="right") - 1] == pytest.approx(inside)
 
 
-def test_leave_one_out(plane):
-    loo = leave_one_out(plane)
+def test_leave_one_out_without_points_that_were_not_observed(data):
+    X, Y = data(num_outputs=2)
+    Y[[0, 3], 1] = torch.nan
+    rest = [1, 2, *range(4, 9)]
+    model = CKA(X, Y, physics=crude)
+    loo = leave_one_out(model)
     axes = plot_leave_one_out(loo, output=1)
-    drawn = axes[0].containers[0][0].get_xydata()
-    np.testing.assert_allclose(drawn, torch.stack([loo.mean[:, 1], loo.Y[:, 1]], dim=-1))
-    ends = np.array(axes[0].containers[0][2][0].get_segments())[:, :, 0].T
-    np.testing.assert_allclose(ends, torch.stack(loo.interval())[..., 1])
-    drawn = axes[1].lines[-1].get_xydata()
-    np.testing.assert_allclose(drawn, torch.stack([loo.mean, loo.residuals], dim=-1)[:, 1])
+    dots, _, (bars,) = axes[0].containers[0]
+    np.testing.assert_allclose(dots.get_xydata(), torch.stack([loo.mean, loo.Y], -1)[rest, 1])
+    ends = np.array(bars.get_segments())[:, :, 0].T
+    np.testing.assert_allclose(ends, torch.stack(loo.interval())[:, rest, 1])
+    residuals = axes[1].lines[-1].get_xydata()[rest]
+    np.testing.assert_allclose(residuals, torch.stack([loo.mean, loo.residuals], -1)[rest, 1])
+    assert np.isfinite(axes[1].get_ylim()).all()
+    steps = curve(plot_coverage(loo, output=1), "observed").get_ydata()
+    np.testing.assert_allclose(np.unique(steps), np.arange(len(rest) + 1) / len(rest))
+    ticks = plot_adjustment(model, output=1)[0, 0].lines[-1]
+    np.testing.assert_allclose(ticks.get_xdata(), X[rest, 0])
 
 
 def test_logarithmic_axes_end_near_the_dots():
-    X = torch.linspace(0, 1, 12, dtype=torch.float64).unsqueeze(-1)
+    X = systems.line(12)
     ax = plot_leave_one_out(leave_one_out(ZeroMeanGP(X, 1.6 * 10 ** (1.2 * X))))[0]
     assert ax.get_xscale() == "log"
     dots = ax.containers[0][0].get_xydata()
@@ -160,33 +170,14 @@ def test_given_axes_are_drawn_on(line, forrester):
     assert plot_adjustment(line, axes=axes)[0, 0] is axes[0]
 
 
-def test_points_that_were_not_observed_are_not_drawn(data):
-    X, Y = data(num_outputs=2)
-    Y[[0, 3], 1] = torch.nan
-    rest = [1, 2, *range(4, 9)]
-    model = CKA(X, Y, physics=crude)
-    loo = leave_one_out(model)
-    axes = plot_leave_one_out(loo, output=1)
-    drawn = axes[0].containers[0][0].get_xydata()
-    np.testing.assert_allclose(drawn, torch.stack([loo.mean, loo.Y], -1)[rest, 1])
-    np.testing.assert_allclose(axes[1].lines[-1].get_ydata()[rest], loo.residuals[rest, 1])
-    assert np.isfinite(axes[1].get_ylim()).all()
-    steps = curve(plot_coverage(loo, output=1), "observed").get_ydata()
-    np.testing.assert_allclose(np.unique(steps), np.arange(len(rest) + 1) / len(rest))
-    ticks = plot_adjustment(model, output=1)[0, 0].lines[-1]
-    np.testing.assert_allclose(ticks.get_xdata(), X[rest, 0])
-
-
 def test_the_figure_of_a_model(line, plane, forrester):
     axes = plot_model(line)
     assert axes.shape == (3, 1)
-    x = np.asarray(curve(axes[0, 0], "mean").get_xdata())
-    expected = line.predict(torch.tensor(x).unsqueeze(-1)).mean.squeeze(-1).detach()
-    np.testing.assert_allclose(curve(axes[0, 0], "mean").get_ydata(), expected, atol=1e-9)
-    dots, (X, Y) = curve(axes[0, 0], "data"), forrester.data(0)
-    np.testing.assert_allclose(dots.get_ydata(), Y[:, 0])
-    f_p = forrester.crude(torch.tensor(x).unsqueeze(-1)).squeeze(-1)
-    np.testing.assert_allclose(curve(axes[0, 0], "physics").get_ydata(), f_p)
+    X, Y = forrester.data(0)
+    x = torch.tensor(curve(axes[0, 0], "mean").get_xdata()).unsqueeze(-1)
+    is_drawn(axes[0, 0], "mean", line.predict(x).mean)
+    is_drawn(axes[0, 0], "physics", forrester.crude(x))
+    is_drawn(axes[0, 0], "data", Y)
     assert [ax.get_ylabel() for ax in axes[:, 0]] == ["y", r"$\rho$", r"$\delta$"]
     of_two = plot_model(plane, output=1)
     assert of_two.shape == (3, 2)

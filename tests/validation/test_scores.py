@@ -25,31 +25,6 @@ MEANS = uniform(2, 4, 7, 3, low=-2, high=2, seed=1)  # of 4 components
 VARIANCES = uniform(2, 4, 7, 3, low=0.1, high=3, seed=2)
 
 
-@pytest.fixture
-def prediction():
-    return MEAN.clone(), VARIANCE.clone(), Y.clone()
-
-
-def test_crps_of_a_sharp_prediction_is_the_absolute_error(prediction):
-    mean, _, y = prediction
-    sharp = torch.full_like(mean, 1e-16)
-    torch.testing.assert_close(Scores.compute(mean, sharp, y).crps, (mean - y).abs().mean(-2))
-
-
-def test_calibrated_and_overconfident_predictions():
-    n = 100_000
-    mean, variance = uniform(n, 2, seed=1), uniform(n, 2, low=0.1, high=2, seed=2)
-    y = mean + variance.sqrt() * torch.randn(n, 2, dtype=torch.float64)
-    for level in (0.5, 0.9, 0.95):
-        sd = (level * (1 - level) / n) ** 0.5
-        scores = Scores.compute(mean, variance, y, level=level)
-        assert ((scores.coverage - level).abs() < 5 * sd).all()
-    assert scipy.stats.kstest(scores.pit[:5000, 0].numpy(), "uniform").pvalue > 1e-3
-    share = Scores.compute(mean, variance / 4, y).coverage
-    expected = 2 * scipy.stats.norm.cdf(1.959964 / 2) - 1
-    assert share.tolist() == pytest.approx([expected] * 2, abs=0.025)
-
-
 def posterior_of(mean, variance):
     """The posterior of a mixture of Gaussians that are independent at all points."""
     return MixturePosterior(mean.mT, torch.diag_embed(variance.mT))
@@ -59,14 +34,12 @@ def test_mixture_against_scipy():
     normal = scipy.stats.norm(MEANS.numpy(), VARIANCES.sqrt().numpy())
     y = Y.numpy()[:, None]
     scores = score(posterior_of(MEANS, VARIANCES), Y, level=0.8)
-    expected = torch.from_numpy(-np.log(normal.pdf(y).mean(1)).mean(-2))
-    torch.testing.assert_close(scores.nlpd, expected)
-    values = torch.from_numpy(normal.cdf(y).mean(1))
-    torch.testing.assert_close(scores.pit, values)
-    inside = ((values > 0.1) & (values < 0.9)).double().mean(-2)
-    torch.testing.assert_close(scores.coverage, inside)
-    expected = (MEANS.mean(1) - Y).square().mean(-2).sqrt()
-    torch.testing.assert_close(scores.rmse, expected)
+    nlpd = torch.from_numpy(-np.log(normal.pdf(y).mean(1)).mean(-2))
+    torch.testing.assert_close(scores.nlpd, nlpd)
+    pit = torch.from_numpy(normal.cdf(y).mean(1))
+    torch.testing.assert_close(scores.pit, pit)
+    torch.testing.assert_close(scores.coverage, ((pit - 0.5).abs() < 0.4).double().mean(-2))
+    torch.testing.assert_close(scores.rmse, (MEANS.mean(1) - Y).square().mean(-2).sqrt())
 
 
 def test_crps_of_a_mixture_is_the_integral():
@@ -82,13 +55,15 @@ def test_crps_of_a_mixture_is_the_integral():
     torch.testing.assert_close(crps, expected.mean(-2), rtol=1e-3, atol=1e-3)
 
 
-def test_a_mixture_of_equal_components_is_the_component(prediction):
-    mean, variance, y = prediction
-    many = [t.unsqueeze(-3).expand(2, 5, 7, 3) for t in (mean, variance)]
-    scores = score(posterior_of(*many), y)
-    expected = Scores.compute(*prediction)
+def same_scores(scores, expected):
     for name in NAMES:
-        torch.testing.assert_close(getattr(scores, name), getattr(expected, name))
+        pair = getattr(scores, name), getattr(expected, name)
+        torch.testing.assert_close(*pair, equal_nan=True)
+
+
+def test_a_mixture_of_equal_components_is_the_component():
+    many = [values.unsqueeze(-3).expand(2, 5, 7, 3) for values in (MEAN, VARIANCE)]
+    same_scores(score(posterior_of(*many), Y), Scores.compute(MEAN, VARIANCE, Y))
 
 
 @pytest.mark.parametrize("num_outputs", [1, 2])
@@ -99,21 +74,16 @@ def test_score_of_a_posterior(num_outputs, mixed):
     variance = uniform(*batch, 7, num_outputs, low=0.1, high=1, seed=2)
     y = uniform(7, num_outputs, seed=3)
     y[2:, num_outputs - 1] = torch.nan
-    joint = [
-        MultivariateNormal(mean[..., j], torch.diag_embed(variance[..., j]))
-        for j in range(num_outputs)
-    ]
+    pairs = zip(mean.unbind(-1), variance.unbind(-1), strict=True)
+    joint = [MultivariateNormal(mean, torch.diag_embed(variance)) for mean, variance in pairs]
     several = MultitaskMultivariateNormal.from_independent_mvns
     joint = joint[0] if num_outputs == 1 else several(joint)
     posterior = GaussianMixturePosterior(joint) if mixed else GPyTorchPosterior(joint)
     scores = score(posterior, y, level=0.5)
     if mixed:
-        expected = score(posterior_of(mean, variance), y, level=0.5)
+        same_scores(scores, score(posterior_of(mean, variance), y, level=0.5))
     else:
-        expected = Scores.compute(mean, variance, y, level=0.5)
-    for name in NAMES:
-        found, other = getattr(scores, name), getattr(expected, name)
-        torch.testing.assert_close(found, other, equal_nan=True)
+        same_scores(scores, Scores.compute(mean, variance, y, level=0.5))
 
 
 def test_score_of_a_model_with_a_link_is_that_of_the_model_within(data):
@@ -128,73 +98,64 @@ def test_score_of_a_model_with_a_link_is_that_of_the_model_within(data):
 
 
 def test_predictions_without_variance_have_their_limits():
-    mean, y = torch.tensor([[1.0], [2.0]]).double(), torch.tensor([[1.5], [2.0]]).double()
-    variance = torch.zeros_like(mean)
-    scores = Scores.compute(mean, variance, y)
-    torch.testing.assert_close(scores.crps, torch.tensor([0.25]).double())
+    mean, y = torch.tensor([[[1.0], [2.0]], [[1.5], [2.0]]]).double()
+    scores = Scores.compute(mean, torch.zeros_like(mean), y)
+    torch.testing.assert_close(scores.crps, torch.tensor([0.25]).double())  # the absolute error
     assert scores.nlpd > 1e10
     assert scores.coverage == 0.5
 
 
-def test_points_that_were_not_observed_are_left_out(prediction):
-    mean, variance, y = prediction
-    partial = y.clone()
+def test_points_that_were_not_observed_are_left_out():
+    partial = Y.clone()
     partial[:, [0, 3], 0] = torch.nan
     partial[:, :, 2] = torch.nan
     rest = [1, 2, 4, 5, 6]
-    found, whole = Scores.compute(mean, variance, partial), Scores.compute(*prediction)
-    part = Scores.compute(*(each[:, rest] for each in prediction))
+    mean = MEAN.clone().requires_grad_()
+    scores, complete = Scores.compute(mean, VARIANCE, partial), Scores.compute(MEAN, VARIANCE, Y)
+    part = Scores.compute(*(values[:, rest] for values in (MEAN, VARIANCE, Y)))
     for name in ("rmse", "nlpd", "crps", "coverage"):
-        of_found, of_whole, of_part = (getattr(each, name) for each in (found, whole, part))
-        torch.testing.assert_close(of_found[:, 0], of_part[:, 0])
-        torch.testing.assert_close(of_found[:, 1], of_whole[:, 1])
-        assert of_found[:, 2].isnan().all()
-    expected = whole.pit.masked_fill(partial.isnan(), torch.nan)
-    torch.testing.assert_close(found.pit, expected, equal_nan=True)
-
-
-def test_gradients_of_scores_skip_what_was_not_observed(prediction):
-    mean, variance, y = (t.clone() for t in prediction)
-    y[0, 1, 2] = torch.nan
-    mean.requires_grad_()
-    scores = Scores.compute(mean, variance, y)
+        value = getattr(scores, name)
+        torch.testing.assert_close(value[:, 0].detach(), getattr(part, name)[:, 0])
+        torch.testing.assert_close(value[:, 1].detach(), getattr(complete, name)[:, 1])
+        assert value[:, 2].isnan().all()
+    expected = complete.pit.masked_fill(partial.isnan(), torch.nan)
+    torch.testing.assert_close(scores.pit.detach(), expected, equal_nan=True)
     for value in (scores.rmse, scores.nlpd, scores.crps):
-        (gradient,) = torch.autograd.grad(value.sum(), mean, retain_graph=True)
+        (gradient,) = torch.autograd.grad(value[:, :2].sum(), mean, retain_graph=True)
         assert gradient.isfinite().all()
-        assert gradient[0, 1, 2] == 0
+        assert (gradient[:, [0, 3], 0] == 0).all()
 
 
-def test_scores_of_a_batch_are_those_of_its_parts(prediction):
-    mean, variance, y = prediction
-    lower, upper = mean - 1, mean + variance
+def test_scores_of_a_batch_are_those_of_its_parts():
+    lower, upper = MEAN - 1, MEAN + VARIANCE
     energy = torch.tensor([1.0, 2.0])
-    whole = Scores.compute(*prediction, interval=(lower, upper), energy=energy, output_names="abc")
-    part = whole[1]
-    expected = Scores.compute(mean[1], variance[1], y[1])
+    options = {"interval": (lower, upper), "energy": energy, "output_names": "abc"}
+    scores = Scores.compute(MEAN, VARIANCE, Y, **options)
+    part = scores[1]
+    expected = Scores.compute(MEAN[1], VARIANCE[1], Y[1])
     torch.testing.assert_close(part.rmse, expected.rmse)
     torch.testing.assert_close(part.pit, expected.pit)
-    torch.testing.assert_close(part.median, (mean[1] - y[1]).abs().median(0).values)
-    inside = ((lower[1] <= y[1]) & (y[1] <= upper[1])).double().mean(0)
+    torch.testing.assert_close(part.median, (MEAN[1] - Y[1]).abs().median(0).values)
+    inside = ((lower[1] <= Y[1]) & (Y[1] <= upper[1])).double().mean(0)
     torch.testing.assert_close(part.coverage, inside)
     assert (part.energy, part.output_names) == (2, ("a", "b", "c"))
-    parts = [*whole]
-    assert len(parts) == len(whole.rmse) > 1
-    torch.testing.assert_close(torch.stack([each.rmse for each in parts]), whole.rmse)
+    assert len(scores.rmse) == 2
+    torch.testing.assert_close(torch.stack([part.rmse for part in scores]), scores.rmse)
     with pytest.raises(TypeError, match="no batch"):
         list(zip(part, range(3), strict=False))  # which is not to end in silence
 
 
-def test_where_no_variance_is_said_only_errors_count(prediction):
-    mean, variance, y = (t.clone() for t in prediction)
+def test_where_no_variance_is_said_only_errors_count():
+    variance = VARIANCE.clone()
     variance[:, 2], variance[..., 0] = torch.nan, torch.nan
     rest = [0, 1, 3, 4, 5, 6]
-    scores = Scores.compute(mean, variance, y)
-    torch.testing.assert_close(scores.rmse, Scores.compute(*prediction).rmse)
-    some = Scores.compute(mean[:, rest, 1:], variance[:, rest, 1:], y[:, rest, 1:])
+    scores = Scores.compute(MEAN, variance, Y)
+    torch.testing.assert_close(scores.rmse, Scores.compute(MEAN, VARIANCE, Y).rmse)
+    some = Scores.compute(*(values[:, rest, 1:] for values in (MEAN, variance, Y)))
     for name in ("nlpd", "crps", "coverage"):
         torch.testing.assert_close(getattr(scores, name)[:, 1:], getattr(some, name))
         assert getattr(scores, name)[:, 0].isnan().all()
-    none = Scores.compute(mean[:, :0], variance[:, :0], y[:, :0])
+    none = Scores.compute(MEAN[:, :0], variance[:, :0], Y[:, :0])
     assert none.median.isnan().all()
     assert none.rmse.shape == (2, 3)
 
@@ -204,9 +165,8 @@ def test_energy_score_is_the_crps_of_one_output():
     pairs = (draws - draws.unsqueeze(1)).abs().sum((0, 1)) / (2 * 40 * 39)
     expected = ((draws - y).abs().mean(0) - pairs).mean((-2, -1))
     torch.testing.assert_close(energy_score(draws, y), expected)
-    y[0] = torch.nan
-    torch.testing.assert_close(energy_score(draws, y)[1], expected[1])
-    assert energy_score(draws, y)[0].isnan()
+    y[0] = expected[0] = torch.nan
+    torch.testing.assert_close(energy_score(draws, y), expected, equal_nan=True)
     sure = uniform(5, 3, seed=3)
     same = energy_score(sure.expand(4, 5, 3), sure + 1)
     torch.testing.assert_close(same, torch.tensor(3.0).double().sqrt())
