@@ -307,18 +307,14 @@ class Collection(Measurements, Display):
         Y = checked_outcomes(Y, len(X), self.num_outputs)
         self._enter([measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)])
 
-    def fail(self, X: Tensor, reason: str | Exception) -> None:
+    def fail(self, X: Tensor, reason: str) -> None:
         """Record failed measurements at points ``n x d``, which are not asked for again."""
         X = checked_points("X", X, self.bounds.shape[-1])
-        if not isinstance(reason, str):
-            reason = f"{type(reason).__name__}: {reason}"
         self._enter([{"x": x, "failed": reason} for x in X.tolist()])
 
-    def withdraw(self, X: Tensor | None = None) -> None:
-        """Withdraw some or all pending points, ``n x d``; :meth:`ask` may return them again."""
-        if X is None:
-            X = self.pending
-        self._enter([{"withdrawn": checked_points("X", X, self.bounds.shape[-1]).tolist()}])
+    def withdraw(self) -> None:
+        """Withdraw all pending points; :meth:`ask` may return them again."""
+        self._enter([{"withdrawn": self.pending.tolist()}])
 
     def run(
         self,
@@ -464,7 +460,7 @@ class Collection(Measurements, Display):
         try:
             result = oracle(X.clone())  # an oracle may change its argument
         except Exception as error:
-            self.fail(X, error)
+            self.fail(X, f"{type(error).__name__}: {error}")
             return error
         try:
             Y = checked_outcomes(result, len(X), self.num_outputs)

@@ -5,6 +5,7 @@ import gc
 import multiprocessing
 import os
 import pickle
+import time
 
 import pytest
 
@@ -168,20 +169,27 @@ class TestHolding:
 
     @pytest.mark.slow
     @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork")
-    def test_not_by_a_fork(self, log):
+    def test_not_by_a_fork_and_no_longer_than_a_process(self, log, tmp_path):
         def child(queue):
-            try:
+            with pytest.raises(LogError) as caught:
                 log.append(RECORDS)
-            except LogError as error:
-                queue.put(str(error))
             log.close()
+            own = MeasurementLog(tmp_path / "own.jsonl")
+            own.open(BOUNDS)
+            own.append(RECORDS)
+            queue.put(str(caught.value))
+            time.sleep(60)
 
         context = multiprocessing.get_context("fork")
         queue = context.SimpleQueue()
         process = context.Process(target=child, args=(queue,))
         process.start()
         assert f"is held by process {os.getpid()}" in queue.get()
+        own = MeasurementLog(tmp_path / "own.jsonl")
+        refused(LogError, f"is held by process {process.pid} on", own.open, BOUNDS)
+        process.kill()
         process.join()
+        assert own.open(BOUNDS) == RECORDS
         refused(LogError, "is held by process", MeasurementLog(log.path).open, BOUNDS)
         log.append(RECORDS)
         assert read(log) == 2 * RECORDS
