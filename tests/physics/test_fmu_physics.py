@@ -160,13 +160,6 @@ def test_threads_and_processes_have_instances_of_their_own(only_one):
     assert copy.deepcopy(again) is again
 
 
-@pytest.mark.slow
-def test_processes_of_joblib_simulate_rows():
-    with joblib.parallel_config(backend="loky", n_jobs=2):
-        found = step()(X)
-    assert torch.equal(found, step()(X))
-
-
 def test_a_value_that_the_fmu_overrules_is_noticed_or_set_again():
     """By model exchange alone states can be set, also such that are computed."""
     computed, start = fmu("tank", 2, of="wall[1].T", initial="calculated"), {"wall_start": 350.0}

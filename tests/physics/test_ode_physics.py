@@ -6,8 +6,6 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from gpadjust.physics import FormulaPhysics, ODEPhysics, PhysicsError, Unknown
@@ -65,23 +63,6 @@ def test_substeps_converge_at_the_order_of_the_method(method, order):
     assert math.log2(error(8) / error(16)) == pytest.approx(order, abs=0.2)
 
 
-@given(
-    substeps=st.integers(1, 30),
-    step=st.floats(1e-6, 1e3),
-    dtype=st.sampled_from([torch.float32, torch.float64]),
-)
-def test_substeps_count(substeps, step, dtype):
-    calls = []
-    physics = ODEPhysics(
-        lambda state, action: calls.append(1) or torch.zeros_like(state),
-        *(step, 1),
-        substeps=substeps,
-        method="euler",
-    )
-    physics(torch.ones(1, 1, dtype=dtype))
-    assert len(calls) == substeps
-
-
 def test_gradients_in_X_and_in_a_parameter():
     physics = ODEPhysics(Spring(), 0.2, 2, substeps=3)
     assert torch.autograd.gradcheck(physics, normal(2, 2, 3).requires_grad_())
@@ -120,26 +101,11 @@ def test_a_formula_is_the_function_of_the_same_equations():
     assert physics.name == rates.name
 
 
-def test_an_unknown_rate_of_a_decay():
-    X, rate = normal(4, 1), torch.tensor([[0.5], [1.0], [2.0]], dtype=torch.float64)
-    unknowns = {"rate": Unknown(1.0, sd=1.0)}
-    decaying = ODEPhysics(lambda s, a, p: -p.rate[:, None] * s, 0.3, 1, unknowns=unknowns)
-    expected = X * (-0.3 * rate.unsqueeze(-1)).exp()
-    torch.testing.assert_close(decaying(X, rate), expected, rtol=1e-7, atol=0)
-
-
 def test_copies_and_the_number_of_outputs():
     physics, X = ODEPhysics(Spring(), 0.1, 2, difference=True), normal(3, 3)
     assert physics.num_outputs == 2  # known at once
     assert physics(torch.ones(0, 3)).shape == (0, 2)
     assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
-
-
-def test_blow_up_names_the_row():
-    physics = ODEPhysics(lambda s, a: s**3, 1.0, 1)
-    with pytest.raises(PhysicsError, match="NaN or inf") as caught:
-        physics(torch.tensor([[0.1], [1e9]], dtype=torch.float64))
-    assert caught.value.rows == (1,)
 
 
 def test_refusals():

@@ -32,13 +32,13 @@ def test_rows_run_on_both_nodes_of_a_cluster():
         ray.init(address=cluster.address, log_to_driver=False)
         cluster.wait_for_nodes()
         register_ray()
-        X = torch.arange(40.0).double().unsqueeze(-1)
+        X = torch.arange(16.0).double().unsqueeze(-1)
         one_each = {"num_cpus": 1}  # or a node may get both workers
         with joblib.parallel_config(backend="ray", n_jobs=2, ray_remote_args=one_each):
             values = physics(X)
             with pytest.raises(PhysicsError, match="no solution here") as caught:
-                physics(X + 60)
-        assert len(caught.value.rows) == 9
+                physics(X + 80)
+        assert len(caught.value.rows) == 5
     finally:
         ray.shutdown()
         cluster.shutdown()
