@@ -92,7 +92,6 @@ class Collection(Measurements, Display):
             keep all limits with ``probability`` by the model. The first points, in ``initial`` or
             ``data``, must be safe by other knowledge, such as f_p. Default: no limits.
         probability: Probability of a measurement within the limits of ``keep``, noise included.
-        num_outputs: Number ``m`` of outputs. Default: by the first measurement.
         fit: Fits a new model, in place. Default: :func:`gpadjust.fit`, for models of this library.
         optimizer_options: Arguments of ``optimize_acqf``, not with ``keep``. Constraints and fixed
             features need first points within them, in ``initial`` or ``data``; later points may
@@ -131,7 +130,6 @@ class Collection(Measurements, Display):
         data: tuple[Tensor, Tensor] | None = None,
         keep: Callable[[Tensor], Tensor] | None = None,
         probability: float = 0.95,
-        num_outputs: int | None = None,
         fit: Callable[[Any], Any] | None = None,
         optimizer_options: dict[str, Any] | None = None,
         log: str | os.PathLike[str] | None = None,
@@ -190,9 +188,7 @@ class Collection(Measurements, Display):
                 f"Expected no optimizer_options with keep, got {sorted(self._options)}: keep takes "
                 "the best of random safe points. Leave the options out."
             )
-        if num_outputs is not None:
-            checked_whole("num_outputs", num_outputs, 1)
-        super().__init__(self.bounds, num_outputs, data)
+        super().__init__(self.bounds, data)
         # A model that limits points needs measurements within the limits before.
         if limits and len(self._first_points) + self.num_observed < self._initial:
             raise ValueError(

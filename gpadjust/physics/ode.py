@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from gpadjust.checks import check_choice, checked_number, checked_whole
 from gpadjust.physics.base import Physics, name_of
-from gpadjust.physics.black_box import FiniteDifferences
 from gpadjust.physics.error import PhysicsError, outline
 from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.parameters import ParameterValues
@@ -44,8 +42,6 @@ class ODEPhysics(Physics):
         method: ``"euler"``, ``"midpoint"`` or ``"rk4"`` (Kutta's 3/8 rule). An adaptive method is
             ``torchdiffeq.odeint`` in a :class:`FunctionPhysics`.
         difference: If True, the output is the change of the state instead of the new state.
-        gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, without
-            second derivatives, which is several times faster if there are many substeps.
         unknowns, inputs, name: As of :class:`Physics`.
 
     Example:
@@ -66,7 +62,6 @@ class ODEPhysics(Physics):
         method: str = "rk4",
         difference: bool = False,
         unknowns: Mapping[str, Unknown] | None = None,
-        gradient: Literal["autograd", "finite-difference"] = "autograd",
         inputs: Sequence[int] | None = None,
         name: str | None = None,
     ) -> None:
@@ -75,8 +70,7 @@ class ODEPhysics(Physics):
             name = name or rhs.name
         super().__init__(unknowns=unknowns, inputs=inputs, name=name_of(rhs, name, "rhs"))
         check_choice("method", method, tuple(METHODS))
-        check_choice("gradient", gradient, ("autograd", "finite-difference"))
-        self.rhs, self.method, self.gradient = rhs, method, gradient
+        self.rhs, self.method = rhs, method
         self.step = checked_number("step", step, above=0)
         self.state_dim = self.num_outputs = checked_whole("state_dim", state_dim, 1)
         self.substeps = checked_whole("substeps", substeps, 1)
@@ -119,11 +113,3 @@ class ODEPhysics(Physics):
                         point = point.add(slope, alpha=h * weight)
             end = point
         return end - state if self.difference else end
-
-    def of_rows(self, rows: Tensor) -> Tensor:
-        """Return the outputs of rows, with the gradient in X by differences if that was chosen."""
-        # Differences in X would cut off the gradient of the parameters of a module.
-        learns = any(p.requires_grad for p in self.parameters())
-        if self.gradient == "autograd" or learns or not rows.requires_grad:
-            return super().of_rows(rows)
-        return FiniteDifferences.apply(rows, super().of_rows(rows.detach()), self)

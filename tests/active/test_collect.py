@@ -350,7 +350,7 @@ def test_a_log_that_does_not_belong(laboratory, tmp_path):
     collect(**laboratory(log=path, budget=2))
     for changes, words in (
         ({"bounds": [[0.0, -2.0], [4.0, 2.0]]}, r"log\.jsonl has measurements within the bounds"),
-        ({"num_outputs": 2}, r"Line 3 of the log .* 2 inputs and 2 outputs"),
+        ({"data": PAIR}, r"Line 3 of the log .* 2 inputs and 2 outputs"),
     ):
         refused(ValueError, words, collect, **laboratory(log=path, **changes))
 

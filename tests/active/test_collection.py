@@ -87,7 +87,7 @@ def test_a_result_is_of_the_nearest_of_the_pending_points(make):
 
 def test_some_of_the_outputs(make, tmp_path):
     path = tmp_path / "log.jsonl"
-    collection = make(log=path, num_outputs=2)
+    collection = make(log=path)
     X = collection.ask(2)
     with pytest.warns(MeasurementWarning, match=r"1 of 2 .* measured \[nan, nan\]"):
         collection.tell(X, torch.tensor([[50.0, torch.inf], [torch.nan] * 2]))

@@ -16,7 +16,7 @@ from gpadjust import CalibratedPhysics, FMUPhysics, PhysicsError, Unknown, fit, 
 from gpadjust.records import Record, Records, identify
 from gpadjust.states import StateSpec
 from tests.fmus import fmu
-from tests.systems import normal, refused, same
+from tests.systems import line, normal, refused, same
 
 STATES = ["tank.T", "wall[1].T"]
 STEP = {"inputs": [*STATES, "heater"], "outputs": STATES, "times": 6.0}
@@ -188,8 +188,8 @@ def test_a_parameter_is_fitted_in_its_unit_and_the_model_is_saved(tmp_path):
         start = {"tank.T": 340.0}
         return FMUPhysics(fmu(), ["time"], STATES, unknowns=G, start_values=start)
 
-    t = torch.linspace(1, 10, 12, dtype=torch.float64).unsqueeze(-1)
-    Y = tank([340.0, 300.0], 0.0, t.flatten().tolist(), g=70.0) + 0.01 * normal(12, 2)
+    t = line(4, 2, 10)
+    Y = tank([340.0, 300.0], 0.0, t.flatten().tolist(), g=70.0) + 0.01 * normal(4, 2)
     model = CalibratedPhysics(t, Y, physics=made())
     fit(model, "map")
     assert model.physics_parameters.mean.item() == pytest.approx(70, abs=0.2)

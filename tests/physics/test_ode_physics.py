@@ -66,18 +66,6 @@ def test_gradients_in_X_and_in_a_parameter():
     assert spring.stiffness.grad.item() == pytest.approx(-0.5 * math.sin(1.0) / 4.0, rel=1e-7)
 
 
-def test_gradients_by_finite_differences_are_those_of_autograd():
-    options, X = {"step": 0.5, "state_dim": 2}, normal(4, 3).requires_grad_()
-    spring, slopes = Spring().requires_grad_(False), []
-    for gradient in ("autograd", "finite-difference"):
-        Y = ODEPhysics(spring, **options, gradient=gradient)(X)
-        slopes.append(torch.autograd.grad(Y.square().sum(), X)[0])
-    torch.testing.assert_close(*slopes, rtol=1e-8, atol=1e-8)
-    learnt = ODEPhysics(Spring(), **options, gradient="finite-difference")
-    learnt(X).sum().backward()  # parameters are learnt by autograd all the same
-    assert learnt.rhs.stiffness.grad.abs() > 0
-
-
 def test_a_formula_is_the_function_of_the_same_equations():
     unknowns, X = {"k": Unknown(3.0, factor=2.0)}, normal(5, 3)
     columns = ["angle", "rate", "torque"]
@@ -101,7 +89,6 @@ def test_refusals():
         (ValueError, "step must be finite and above 0; found 0.0", {"step": 0.0}),
         (ValueError, "state_dim must be at least 1; found 0", {"state_dim": 0}),
         (ValueError, "Unknown method 'magic'.*euler.*rk4", {"method": "magic"}),
-        (ValueError, r"'none'.*'autograd' or 'finite", {"gradient": "none"}),
         (TypeError, "rhs must be callable; found str", {"rhs": "decay"}),
     ):
         refused(error, says, ODEPhysics, **{"rhs": decay, "step": 0.1, "state_dim": 1, **changes})
