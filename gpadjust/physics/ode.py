@@ -28,9 +28,7 @@ class ODEPhysics(Physics):
 
     With :math:`x = (s, a)`, a state and an action that is held during the step :math:`h`,
 
-    .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s,
-
-    or :math:`s(h) - s` with ``difference=True``.
+    .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s.
 
     Args:
         rhs: The time derivative :math:`g`, a function of state ``N x state_dim``, action ``N x a``
@@ -41,7 +39,6 @@ class ODEPhysics(Physics):
         substeps: Integration steps within the step.
         method: ``"euler"``, ``"midpoint"`` or ``"rk4"`` (Kutta's 3/8 rule). An adaptive method is
             ``torchdiffeq.odeint`` in a :class:`FunctionPhysics`.
-        difference: If True, the output is the change of the state instead of the new state.
         unknowns, inputs, name: As of :class:`Physics`.
 
     Example:
@@ -60,7 +57,6 @@ class ODEPhysics(Physics):
         *,
         substeps: int = 10,
         method: str = "rk4",
-        difference: bool = False,
         unknowns: Mapping[str, Unknown] | None = None,
         inputs: Sequence[int] | None = None,
         name: str | None = None,
@@ -74,7 +70,6 @@ class ODEPhysics(Physics):
         self.step = checked_number("step", step, above=0)
         self.state_dim = self.num_outputs = checked_whole("state_dim", state_dim, 1)
         self.substeps = checked_whole("substeps", substeps, 1)
-        self.difference = difference
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if the equations are a text, and data have another order."""
@@ -82,7 +77,7 @@ class ODEPhysics(Physics):
             self.rhs.check_names(names)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the state after the step or its change, ``N x state_dim``."""
+        """Return the state after the step, ``N x state_dim``."""
         state, action = X[:, : self.state_dim], X[:, self.state_dim :]
 
         def derivative(state: Tensor) -> Tensor:
@@ -112,4 +107,4 @@ class ODEPhysics(Physics):
                     if weight:
                         point = point.add(slope, alpha=h * weight)
             end = point
-        return end - state if self.difference else end
+        return end

@@ -38,7 +38,7 @@ PHYSICS = {
     "everything": FormulaPhysics(EVERYTHING, ["x", "v"]),
     "spring": SPRING,
     "rk4": ODEPhysics(SPRING, 0.1, 2, substeps=3),
-    "midpoint, change": ODEPhysics(SPRING, 0.1, 2, substeps=2, method="midpoint", difference=True),
+    "midpoint": ODEPhysics(SPRING, 0.1, 2, substeps=2, method="midpoint"),
     "euler, columns": ODEPhysics(SPRING, 0.1, 2, method="euler", inputs=[2, 0, 1]),
     "curves": ODEPhysics(CURVED, 0.1, 2, substeps=2),
 }

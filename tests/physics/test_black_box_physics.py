@@ -1,7 +1,6 @@
 """NumPy functions and simulators as physics: values, gradients, failures, parallel calls, memo."""
 
 import copy
-import os
 import pickle
 import sys
 import threading
@@ -10,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import cloudpickle
-import joblib
 import numpy as np
 import pytest
 import torch
@@ -74,16 +72,6 @@ def test_rows_are_float64_columns_that_the_function_may_overwrite(batched):
 
 
 # Gradients
-
-
-@pytest.mark.parametrize("batched", [True, False])
-def test_gradients_agree_with_autograd(batched):
-    physics = BlackBoxPhysics(waves, batched=batched)
-    X, weights = normal(3, 4, 2).requires_grad_(), normal(3, 4, 2, seed=1)
-    (found,) = torch.autograd.grad((weights * physics(X)).sum(), X)
-    (expected,) = torch.autograd.grad((weights * torch_waves(X)).sum(), X)
-    assert torch.allclose(found, expected, rtol=1e-7, atol=1e-8)
-    assert torch.autograd.gradcheck(physics, X)
 
 
 def test_gradients_of_repeated_rows_are_not_remembered():
@@ -218,29 +206,6 @@ def test_good_rows_survive_failed_ones(grad):
 
 
 # Parallel calls
-
-
-@pytest.mark.slow
-def test_processes_share_the_rows():
-    class UnpicklableError(Exception):
-        def __init__(self, code, reason):
-            super().__init__(f"{reason} ({code})")
-
-    def simulate(x):
-        if x[0] < 0:
-            raise UnpicklableError(7, "diverged")
-        return float(os.getpid())
-
-    physics = BlackBoxPhysics(simulate, batched=False)
-    X = torch.tensor([[1.0], [-1.0], [2.0], [3.0]], dtype=torch.float64)
-    with (
-        joblib.parallel_config(backend="loky", n_jobs=2),
-        pytest.raises(PhysicsError, match=r"UnpicklableError: diverged \(7\)") as caught,
-    ):
-        physics(X)
-    assert caught.value.rows == (1,)
-    processes = physics(X[[0, 2, 3]])
-    assert os.getpid() not in processes.flatten().tolist()
 
 
 def test_handles_and_lambdas_are_copied():

@@ -171,18 +171,6 @@ def test_a_value_that_the_fmu_overrules_is_noticed_or_set_again():
     assert torch.equal(step(start_values=start, kind="ModelExchange")(X), expected)
 
 
-@of_all_kinds
-def test_a_whole_number_is_one(fmi, kind):
-    names = ["tank.T", "walls"]
-    options = {"start_values": {"wall[1].T": 300.0}, "kind": kind, "times": 6.0}
-    physics = FMUPhysics(fmu("tank", fmi), names, names, **options)
-    found = physics(torch.tensor([[320.0, 2.0]]).double())
-    expected = [tank([320.0, 300.0], 0.0, [6.0], g=100.0)[0, 0].item(), 2.0]
-    assert found[0].tolist() == pytest.approx(expected, rel=1e-7)
-    rows = torch.tensor([[320.0, 1.5]]).double()
-    refused(PhysicsError, "'walls' is 1 after.*set to 1.5.*rounds it", physics, rows)
-
-
 def test_a_model_has_the_unit_of_a_parameter_and_is_saved(tmp_path):
     physics = step(unknowns=G)
     model = CalibratedPhysics(X, X[:, :2], physics=physics)

@@ -38,13 +38,6 @@ def test_linear_system_is_a_matrix_exponential():
     assert torch.allclose(physics(X), X @ matrix.T, atol=1e-6, rtol=1e-6)
 
 
-def test_a_difference_is_from_the_start():
-    X = normal(6, 3)
-    state = ODEPhysics(Spring(), 0.2, 2)(X)
-    change = ODEPhysics(Spring(), 0.2, 2, difference=True)(X)
-    assert torch.allclose(change, state - X[..., :2], atol=1e-15)
-
-
 @pytest.mark.parametrize(("method", "order"), [("euler", 1), ("midpoint", 2), ("rk4", 4)])
 def test_substeps_converge_at_the_order_of_the_method(method, order):
     X = torch.ones(1, 1, dtype=torch.float64)

@@ -220,7 +220,7 @@ def test_gradients_in_X(make):
     weights = normal(3, 4, 2, seed=2)
     outputs = make()(X, values), wave_at(X, values)
     slopes = [torch.autograd.grad((weights * Y).sum(), X)[0] for Y in outputs]
-    torch.testing.assert_close(*slopes, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(*slopes, rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["function", "class"])
