@@ -26,7 +26,6 @@ TANK = [
     ("wall[1].C", "J/K", "parameter", *CONSTANT, 1000, 0),
     ("loss", "W/K", "parameter", *CONSTANT, 10, 0),
     ("wall_start", "K", "parameter", *CONSTANT, 0, 0),
-    ("walls", "", "parameter", *CONSTANT, 1, 0),
 ]
 BALL = [
     ("h", "m", "output", *STATE, 1, 0),
@@ -52,7 +51,6 @@ def description(name, fmi, variables, number, indicators, interface):
         f"<CoSimulation{attributes(modelIdentifier=name, **interface['any'], **interface['cs'])}/>"
     )
     units = "".join(f'<Unit name="{unit}"/>' for unit in sorted({v[1] for v in variables} - {""}))
-    kinds_of_numbers = {2: ("Real", "Integer"), 3: ("Float64", "Int32")}[fmi]
     rates = [i for i, v in enumerate(variables) if v[6]]
     text = ""
     for i, (own, unit, causality, variability, initial, start, rate) in enumerate(variables):
@@ -61,12 +59,11 @@ def description(name, fmi, variables, number, indicators, interface):
         value = {"unit": unit, "start": None if initial == "calculated" else start}
         if rate:
             value["derivative"] = rate if fmi == 2 else rate - 1
-        kind = kinds_of_numbers[own == "walls"]
         if fmi == 2:
-            real = f"<{kind}{attributes(**value)}/>"
+            real = f"<Real{attributes(**value)}/>"
             text += f"<ScalarVariable{attributes(**about)}>{real}</ScalarVariable>"
         else:
-            text += f"<{kind}{attributes(**about, **value)}/>"
+            text += f"<Float64{attributes(**about, **value)}/>"
     if fmi == 2:
         entries = "".join(f'<Unknown index="{i + 1}"/>' for i in rates)
         structure = f"<Derivatives>{entries}</Derivatives>"

@@ -12,8 +12,6 @@
 #define fmi(name) fmi2##name
 #define GET_NUMBERS fmi2GetReal
 #define SET_NUMBERS fmi2SetReal
-#define GET_INTEGERS fmi2GetInteger
-#define SET_INTEGERS fmi2SetInteger
 #define GET_RATES fmi2GetDerivatives
 typedef fmi2ValueReference Reference;
 typedef fmi2Boolean Boolean;
@@ -23,8 +21,6 @@ typedef fmi2CallbackLogger Logger;
 #define fmi(name) fmi3##name
 #define GET_NUMBERS fmi3GetFloat64
 #define SET_NUMBERS fmi3SetFloat64
-#define GET_INTEGERS fmi3GetInt32
-#define SET_INTEGERS fmi3SetInt32
 #define GET_RATES fmi3GetContinuousStateDerivatives
 typedef fmi3ValueReference Reference;
 typedef fmi3Boolean Boolean;
@@ -33,9 +29,9 @@ typedef fmi3LogMessageCallback Logger;
 enum { OK = 0, ERROR = 3 };
 
 #if MODEL == 1
-enum { TOKEN = 1, STATES = 2, INDICATORS = 0, VALUES = 12 };
-enum { T, WALL, DT, DWALL, HEATER, AMBIENT, C, G, WALL_C, LOSS, START, WALLS };
-static const double START_VALUES[VALUES] = {300, 300, 0, 0, 0, 300, 4000, 50, 1000, 10, 0, 1};
+enum { TOKEN = 1, STATES = 2, INDICATORS = 0, VALUES = 11 };
+enum { T, WALL, DT, DWALL, HEATER, AMBIENT, C, G, WALL_C, LOSS, START };
+static const double START_VALUES[VALUES] = {300, 300, 0, 0, 0, 300, 4000, 50, 1000, 10, 0};
 #else
 enum { TOKEN = 2, STATES = 2, INDICATORS = 1, VALUES = 6 };
 enum { H, V, DH, DV, E, GRAVITY };
@@ -63,7 +59,7 @@ static int failed(Model *m, const char *text)
 static void rates(double *v)
 {
 #if MODEL == 1
-    const double in = v[WALLS] * v[G] * (v[T] - v[WALL]);
+    const double in = v[G] * (v[T] - v[WALL]);
     v[DT] = (v[HEATER] - in) / v[C];
     v[DWALL] = (in - v[LOSS] * (v[WALL] - v[AMBIENT])) / v[WALL_C];
 #else
@@ -149,18 +145,6 @@ int SET_NUMBERS(Model *m, const Reference *r, size_t n, const double *value)
 #endif
         m->v[r[i]] = value[i];
     }
-    return OK;
-}
-
-int GET_INTEGERS(Model *m, const Reference *r, size_t n, int *value)
-{
-    for (size_t i = 0; i < n; i++) value[i] = (int)m->v[r[i]];
-    return OK;
-}
-
-int SET_INTEGERS(Model *m, const Reference *r, size_t n, const int *value)
-{
-    for (size_t i = 0; i < n; i++) m->v[r[i]] = value[i];
     return OK;
 }
 
