@@ -40,25 +40,16 @@ def test_one_output_no_rows_and_columns():
     assert torch.equal(FunctionPhysics(lambda X: X, inputs=[-1, 0, -4, 3])(X), X[..., [3, 0, 0, 3]])
 
 
-@pytest.mark.parametrize("grad", [False, True])
-def test_result_has_the_dtype_of_X(grad):
-    X = torch.tensor([[1.5]], dtype=torch.float64, requires_grad=grad)
-    Y = FunctionPhysics(lambda X: X.float())(X)
-    assert Y.dtype == torch.float64
-    assert Y.requires_grad == grad
-
-
 # Gradients
 
 
-def test_gradient_in_X():
+def test_gradients_where_they_are_needed():
     physics = FunctionPhysics(lambda X: torch.stack([X.prod(-1), X[:, 0].sin()], -1))
     X = normal(2, 3, 2).requires_grad_()
     assert torch.autograd.gradcheck(physics, X)
     assert torch.autograd.gradgradcheck(physics, X)
-
-
-def test_no_graph_where_none_is_needed():
+    Y = FunctionPhysics(lambda X: X.float())(X)
+    assert (Y.dtype, Y.requires_grad) == (torch.float64, True)
     scale, X = Scale(), normal(3, 1)
     physics = FunctionPhysics(scale)
     assert physics(X).requires_grad
@@ -203,11 +194,10 @@ def test_names_and_a_subclass_that_has_evaluate_alone():
             return -X * X.abs()
 
     X, drag = normal(3, 2), Drag(inputs=[1])
-    assert drag.name == "Drag"
     assert torch.equal(drag(X), -X[:, 1:] * X[:, 1:].abs())
-    assert FunctionPhysics(torch.sin).name == "sin"
-    assert FunctionPhysics(torch.nn.Tanh()).name == "Tanh"
-    assert FunctionPhysics(torch.sin, name="wave").name == "wave"
+    sines = FunctionPhysics(torch.sin), FunctionPhysics(torch.sin, name="wave")
+    kinds = (drag, *sines, FunctionPhysics(torch.nn.Tanh()))
+    assert [physics.name for physics in kinds] == ["Drag", "sin", "wave", "Tanh"]
 
 
 ARRAY = np.linspace(0.1, 1, 6).reshape(3, 2)
@@ -226,13 +216,7 @@ def test_functions_of_numpy_and_torch_are_told_apart():
     assert rows == [1]
     assert ARRAY.min() > 0
     linear = torch.nn.Linear(2, 1).double()
-    for function in (
-        torch.sin,
-        lambda X: X.sin(),
-        lambda X: torch.cat([X[:, :1].exp(), X[:, 1:]], dim=1),
-        lambda X: torch.as_tensor(X) * 2,
-        linear,
-    ):
+    for function in (torch.sin, lambda X: X.sin(), lambda X: torch.as_tensor(X) * 2, linear):
         physics = array_physics(function, ARRAY)
         assert type(physics) is FunctionPhysics
         X = torch.tensor(ARRAY)
