@@ -7,6 +7,7 @@ import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
+from functools import partial
 
 import cloudpickle
 import numpy as np
@@ -41,15 +42,9 @@ class Counter:
         return np.stack([np.square(X).sum(-1), np.sin(X[:, 0])], axis=-1)
 
 
-class Handle:
-    """A simulator that cannot be pickled or copied."""
-
-    def __init__(self):
-        self.lock = threading.Lock()
-
-    def __call__(self, X):
-        with self.lock:
-            return waves(X)
+def locked(lock, X):
+    with lock:
+        return waves(X)
 
 
 @pytest.mark.parametrize("batched", [True, False])
@@ -209,16 +204,13 @@ def test_good_rows_survive_failed_ones(grad):
 
 
 def test_handles_and_lambdas_are_copied():
-    physics, X = BlackBoxPhysics(Handle()), normal(3, 2)
+    """A handle, such as a lock, cannot be pickled or copied."""
+    physics, X = BlackBoxPhysics(partial(locked, threading.Lock())), normal(3, 2)
     assert copy.deepcopy(torch.nn.ModuleList([physics]))[0] is physics
     assert torch.allclose(copy.copy(physics)(X), torch_waves(X))
     scale = 3.0
     loaded = pickle.loads(cloudpickle.dumps(BlackBoxPhysics(lambda X: scale * waves(X))))
-    X.requires_grad_()
-    Y, expected = loaded(X), 3.0 * torch_waves(X)
-    assert torch.allclose(Y, expected)
-    slopes = [torch.autograd.grad(y.sum(), X)[0] for y in (Y, expected)]
-    assert torch.allclose(*slopes)
+    assert torch.allclose(loaded(X), 3.0 * torch_waves(X))
 
 
 # The memo
@@ -299,16 +291,12 @@ def test_threads_share_a_memo_that_overflows():
     sys.setswitchinterval(interval)
 
 
-def double(X):
-    return 2 * X
-
-
 def refuse(X):
     raise AssertionError(f"asked for {X.tolist()}")
 
 
 def test_capacity_copies_and_pickles_of_the_memo():
-    memo = RowMemo(capacity=3)
+    memo, double = RowMemo(capacity=3), partial(torch.mul, 2)
     old, new = torch.tensor([[0.0], [1.0]]), torch.tensor([[2.0], [3.0]])
     memo.recall(old, double)
     with torch.inference_mode():

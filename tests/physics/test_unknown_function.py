@@ -17,7 +17,7 @@ from gpadjust.physics import (
     Unknown,
 )
 from gpadjust.states import StateSpec
-from tests.systems import normal, refused, uniform
+from tests.systems import normal, refused, same, uniform
 
 OVER = {"function_of": "abs(v)", "between": (0.0, 6.0)}
 PRIORS = {
@@ -54,22 +54,19 @@ def test_at_each_point_it_has_its_prior(prior):
 
 def test_between_the_knots_it_is_a_gaussian_process():
     """The formula of a conditional mean, and of Matern's kernel."""
-    unknown = PRIORS["sd"]
-    scale, knots = unknown.lengthscale, torch.linspace(0, 6, 13).double()
-    assert scale == 1.5
+    unknown, knots = PRIORS["sd"], torch.linspace(0, 6, 13).double()
+    assert unknown.lengthscale == 1.5
 
     def kernel(a, b):
-        r = 5**0.5 * (a[:, None] - b).abs() / scale
+        r = 5**0.5 * (a[:, None] - b).abs() / 1.5
         return (1 + r + r**2 / 3) * (-r).exp()
 
     unknowns = FunctionPhysics(by_torch, unknowns={"friction": unknown}).unknowns
-    values = 0.3 + 0.2 * normal(13)
-    x = uniform(5, 1, high=6.0)[:, 0]
+    values, x = 0.3 + 0.2 * normal(13), uniform(5, 1, high=6.0)[:, 0]
     expected = 0.3 + kernel(x, knots) @ torch.linalg.solve(kernel(knots, knots), values - 0.3)
     found = PhysicsParameters(unknowns, values[None].unbind(-1)).friction(x)[0]
-    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
     covariance = unknown.root @ unknown.root.mT
-    torch.testing.assert_close(covariance, kernel(knots, knots), rtol=1e-6, atol=1e-6)
+    same([found, covariance], [expected, kernel(knots, knots)], rtol=1e-6, atol=1e-6)
 
 
 def test_formulas_and_functions_of_torch_and_numpy_read_the_same():
