@@ -3,7 +3,6 @@
 import json
 import math
 
-import numpy as np
 import pytest
 import torch
 from botorch import fit_gpytorch_mll
@@ -14,7 +13,6 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from gpadjust import CKA
 from gpadjust.active import (
-    Collection,
     CollectionError,
     LogError,
     MeasurementWarning,
@@ -117,19 +115,16 @@ def test_a_model_of_botorch(laboratory, bounds):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [(throw(OSError("no gas")), "OSError: no gas"), (lambda Y: Y + math.inf, r"measured \[inf\]")],
-)
-def test_failures_are_skipped_and_counted(laboratory, tmp_path, what, message):
-    path, oracle = tmp_path / "log.jsonl", Oracle({6: what})
-    with pytest.warns(MeasurementWarning, match=message):
+def test_failures_are_skipped_and_counted(laboratory, tmp_path):
+    path, oracle = tmp_path / "log.jsonl", Oracle({6: throw(OSError("no gas")), 7: nothing})
+    with pytest.warns(MeasurementWarning) as caught:
         result = collect(**laboratory(oracle=oracle, log=path))
+    for warning, words in zip(caught, ("OSError: no gas", "measured [nan]"), strict=True):
+        assert words in str(warning.message)
     assert len(oracle.asked) == 7
-    assert result.X.shape == (6, 2)
-    assert torch.equal(result.failed_X, oracle.asked[5])
-    (record,) = records(path, "failed")
-    assert record["x"] == result.failed_X[0].tolist()
+    assert result.X.shape == (5, 2)
+    assert torch.equal(result.failed_X, torch.cat(oracle.asked[5:]))
+    assert [record["x"] for record in records(path, "failed")] == result.failed_X.tolist()
 
 
 @pytest.mark.slow
@@ -279,16 +274,12 @@ FIXED = {"fixed_features": {1: 0.5}}
 NEEDS = "With fixed_features, .* {} or more .* found 0"
 REFUSED = [
     ({"budget": 0}, "budget must be at", ValueError),
-    ({"bounds": [0.0, 1.0]}, r"shape 2 x d.* got \(2,\)", ValueError),
     ({"model_factory": 3}, "Expected model_factory to be callable, got 3", TypeError),
     ({"initial": 1}, "initial, a number of points, must", ValueError),
-    ({"initial": [[5.0, 0.0], [1.0, 0.0]]}, r"initial within the bounds .*5.0, 0.0", ValueError),
     ({"initial": [[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]}, "points of initial to differ", ValueError),
     ({"data": torch.ones(3, 2)}, r"data to be a pair \(X, Y\), got tensor", TypeError),
-    ({"data": (GIVEN, GIVEN[:3, :1])}, r"shape 4 x m, .* got \(3, 1\)", ValueError),
     ({"data": (GIVEN, GIVEN[:, :1] * math.nan)}, "the Y of data to hold an obs", ValueError),
     ({"seed": -1}, "seed must be at least 0; found -1", ValueError),
-    ({"optimizer_options": [1]}, r"to be a dictionary, got \[1\]", TypeError),
     ({"optimizer_options": {"q": 2}}, r"without \['q'\]", ValueError),
     ({"optimizer_options": {"num_restart": 2}}, r"Unknown .* \['num_restart'\]", ValueError),
     ({"optimizer_options": FIXED, "initial": None}, NEEDS.format(2), ValueError),
@@ -353,10 +344,3 @@ def test_a_log_that_does_not_belong(laboratory, tmp_path):
         ({"data": PAIR}, r"Line 3 of the log .* 2 inputs and 2 outputs"),
     ):
         refused(ValueError, words, collect, **laboratory(log=path, **changes))
-
-
-def test_seeds_and_numbers_of_numpy_are_taken():
-    problem = (lambda X, Y: None, [[0.0], [1.0]], lambda model: None)
-    collection = Collection(*problem, seed=np.int64(3), initial=np.int64(5))
-    assert (collection.seed, type(collection.seed)) == (3, int)
-    assert torch.equal(collection.ask(), Collection(*problem, seed=3, initial=5).ask())

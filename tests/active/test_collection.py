@@ -137,16 +137,26 @@ REFUSED = [
     (torch.ones(2, 2), torch.ones(3, 1), ValueError, r"shape 2 x 1, .* got \(3, 1\)"),
     (torch.ones(1, 2), torch.ones(1) * 1j, TypeError, "measured values to be real.*complex"),
 ]
+LINES = [
+    ('{"x": [0.5, 0.0], "y": [null]}', "nothing but NaN"),
+    ('{"x": [0.5, 0.0], "y": ["a"]}', "to be real numbers"),
+    ('{"x": [0.5, 0.0]}', "KeyError: 'y'"),
+    ('{"asked": "abc"}', "Expected X to be real numbers"),
+]
 
 
-def test_bad_tellings_change_nothing(make, tmp_path):
+def test_bad_tellings_and_records_change_nothing(make, tmp_path):
     path = tmp_path / "log.jsonl"
     collection = filled(make(log=path), 1)
-    before = path.read_bytes()
+    before = path.read_text()
     for X, Y, error, words in REFUSED:
         refused(error, words, collection.tell, X, Y)
-    assert path.read_bytes() == before
+    assert path.read_text() == before
     assert len(collection.X) == 1
+    collection.close()
+    for line, words in LINES:
+        path.write_text(before + line + "\n")
+        refused(ValueError, rf"Line 4 of the .*jsonl, .* 2 inputs.*{words}", make, log=path)
 
 
 def test_out_of_scope_a_collection_holds_no_log(make, tmp_path, bounds):
@@ -185,18 +195,3 @@ def test_what_cannot_be_logged_is_not_taken(make, tmp_path, monkeypatch):
     collection.tell(X, truth(X))
     collection.close()
     assert torch.equal(make(log=path).X, collection.X)
-
-
-def test_a_record_that_does_not_belong(make, tmp_path):
-    path = tmp_path / "log.jsonl"
-    filled(make(log=path), 1)
-    before = path.read_text()
-    for line, words in (
-        ('{"x": [0.5], "y": [1.0]}', r"Expected X of shape n x 2"),
-        ('{"x": [0.5, 0.0], "y": [null]}', "nothing but NaN"),
-        ('{"x": [0.5, 0.0], "y": ["a"]}', "to be real numbers"),
-        ('{"x": [0.5, 0.0]}', "KeyError: 'y'"),
-        ('{"asked": "abc"}', "Expected X to be real numbers"),
-    ):
-        path.write_text(before + line + "\n")
-        refused(ValueError, rf"Line 4 of the .*jsonl, .* 2 inputs.*{words}", make, log=path)
