@@ -46,13 +46,10 @@ def truth(time, dose):
 
 def client(fit_options=FAST, **options):
     ours = Client()
+    time = {"name": "time", "bounds": (0.01, 10.0), "scaling": "log"}
+    parameters = [time, {"name": "dose", "bounds": (0.0, 4.0)}]
     ours.configure_experiment(
-        parameters=[
-            RangeParameterConfig(
-                name="time", parameter_type="float", bounds=(0.01, 10.0), scaling="log"
-            ),
-            RangeParameterConfig(name="dose", parameter_type="float", bounds=(0.0, 4.0)),
-        ]
+        parameters=[RangeParameterConfig(parameter_type="float", **each) for each in parameters]
     )
     ours.configure_optimization(objective="output", outcome_constraints=["waste <= 9"])
     strategy = generation_strategy(
