@@ -106,42 +106,37 @@ READ = {
     "no names": case(made(""), options=["--names", "time,u,T"]),
     "names in place of others": case(made("Zeit,Stellgrad,Temp"), options=["--names", "time,u,T"]),
     "words for what is missing": case(made("time,u,T", temperatures=[x or "N/A" for x in T])),
-    "ISO dates": case(made("date,u,T", times=ISO), {"time": "date"}),
-    "ISO dates in a zone": case(
-        made("date,u,T", times=[t.replace(" ", "T") + "+01:00" for t in ISO]), {"time": "date"}
-    ),
     "German dates": case(
         made("Datum;u;T", ";", times=dated("%d.%m.%Y %H:%M:%S,%%1f")), {"time": "Datum"}
     ),
-    "American dates": case(
-        made("date,u,T", times=dated("%m/%d/%Y %I:%M:%S.%%1f %p")), {"time": "date"}
-    ),
-    "times of day": case(
-        made("clock,u,T", times=["14:19:59", "14:19:59.5", "14:20:00", "14:20:00.5"]),
-        {"time": "clock"},
-    ),
     "a workbook": case(workbook(), {"time": "when"}, SQUARE),
-    "milliseconds": case(
+    "seconds since another time": case(
         made("t [ms],u,T", times=["7000", "7500", "8000", "8500"]), {"time": "t", "offset": 7}
     ),
-    "microseconds": case(made("t (µs),u,T", times=["0", "5e5", "1e6", "15e5"]), {"time": "t"}),
-    "milliseconds in a name": case(
-        made("time_ms,u,T", times=["0", "500", "1000", "1500"]), {"time": "time_ms"}
+}
+TIMED = {  # names and texts of times, a unit to read them in
+    "ISO dates": ("date", ISO, ""),
+    "ISO dates in a zone": ("date", [t.replace(" ", "T") + "+01:00" for t in ISO], ""),
+    "American dates": ("date", dated("%m/%d/%Y %I:%M:%S.%%1f %p"), ""),
+    "times of day": ("clock", ["14:19:59", "14:19:59.5", "14:20:00", "14:20:00.5"], ""),
+    "microseconds": ("t (µs)", ["0", "5e5", "1e6", "15e5"], ""),
+    "milliseconds in a name": ("time_ms", ["0", "500", "1000", "1500"], ""),
+    "milliseconds as a name": ("millis", ["0", "500", "1000", "1500"], ""),
+    "minutes": ("t [min]", TIMES, "min"),
+    "minutes in hours": ("t [min]", ["0", "30", "60", "90"], "h"),
+    "dates in days": (
+        "t",
+        ["2015-02-13", "2015-02-13 12:00", "2015-02-14", "2015-02-14 12:00"],
+        "d",
     ),
-    "milliseconds as a name": case(
-        made("millis,u,T", times=["0", "500", "1000", "1500"]), {"time": "millis"}
-    ),
-    "minutes": case(made("t [min],u,T"), {"time": "t"}, of_time=["--time-unit", "min"]),
-    "minutes in hours": case(
-        made("t [min],u,T", times=["0", "30", "60", "90"]),
-        {"time": "t"},
-        of_time=["--time-unit", "h"],
-    ),
-    "dates in days": case(
-        made("t,u,T", times=["2015-02-13", "2015-02-13 12:00", "2015-02-14", "2015-02-14 12:00"]),
-        {"time": "t"},
-        of_time=["--time-unit", "d"],
-    ),
+}
+READ |= {
+    name: case(
+        made(f"{head},u,T", times=times),
+        {"time": head.split()[0]},
+        of_time=["--time-unit", unit] if unit else [],
+    )
+    for name, (head, times, unit) in TIMED.items()
 }
 REFUSED = {
     "thousands, or decimals": case(
