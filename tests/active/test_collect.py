@@ -280,6 +280,7 @@ REFUSED = [
     ({"data": torch.ones(3, 2)}, r"data to be a pair \(X, Y\), got tensor", TypeError),
     ({"data": (GIVEN, GIVEN[:, :1] * math.nan)}, "the Y of data to hold an obs", ValueError),
     ({"seed": -1}, "seed must be at least 0; found -1", ValueError),
+    ({"optimizer_options": [1]}, r"to be a dictionary, got \[1\]", TypeError),
     ({"optimizer_options": {"q": 2}}, r"without \['q'\]", ValueError),
     ({"optimizer_options": {"num_restart": 2}}, r"Unknown .* \['num_restart'\]", ValueError),
     ({"optimizer_options": FIXED, "initial": None}, NEEDS.format(2), ValueError),

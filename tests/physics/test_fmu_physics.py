@@ -241,9 +241,10 @@ def test_files_that_are_refused(tmp_path, monkeypatch):
 def test_steps_of_one_length_and_columns():
     path = fmu("tank", 2, any_step=False)
     physics = FMUPhysics(path, ["heater", "time"], STATES, communication_step=2.0)
-    even, odd = (torch.tensor([[0.0, t]]).double() for t in (6.0, 5.0))
+    even, odd, before = (torch.tensor([[0.0, t]]).double() for t in (6.0, 5.0, -1.0))
     assert physics(even).isfinite().all()
     refused(PhysicsError, "no step ends at t = 5.*steps of one length", physics, odd)
+    refused(PhysicsError, "times of 0 or later, found -1", physics, before)
     refused(PhysicsError, r"a column of X for each of the inputs.*columns=; found 3", physics, X)
     refused(ValueError, "in the order of the data", physics.check_names, ["time", "heater"])
     chosen = FMUPhysics(path, ["heater"], STATES, times=6.0, columns=[2])
