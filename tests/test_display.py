@@ -149,19 +149,6 @@ def test_an_object_draws_itself_and_shows_its_numbers(name):
         assert each in html
 
 
-def test_a_collection_draws_its_regret_where_the_optimum_is_known():
-    found = collection()
-    axes = found.plot(optimum=3.0)
-    names = ["$x_{1}$", "$x_{2}$", "$y_{1}$", "regret of $y_{1}$"]
-    assert [ax.get_ylabel() for ax in axes] == names
-    (regret,) = axes[-1].get_lines()
-    best = found.Y[:, 0].cummax(0).values
-    np.testing.assert_allclose(regret.get_ydata(), 3.0 - best)
-    for wrong in ([1.0, 2.0], np.nan):
-        with pytest.raises(ValueError, match="optimum as 1 finite numbers, one of each output"):
-            found.plot(optimum=wrong)
-
-
 def test_texts_of_a_table_are_escaped():
     texts = ["<a>", "<b>", "<script>"]
     html = html_table(texts[0], [texts[1]], [[texts[2]]])

@@ -92,7 +92,6 @@ class Collection(Measurements, Display):
             keep all limits with ``probability`` by the model. The first points, in ``initial`` or
             ``data``, must be safe by other knowledge, such as f_p. Default: no limits.
         probability: Probability of a measurement within the limits of ``keep``, noise included.
-        num_outputs: Number ``m`` of outputs. Default: by the first measurement.
         fit: Fits a new model, in place. Default: :func:`gpadjust.fit`, for models of this library.
         optimizer_options: Arguments of ``optimize_acqf``, not with ``keep``. Constraints and fixed
             features need first points within them, in ``initial`` or ``data``; later points may
@@ -131,7 +130,6 @@ class Collection(Measurements, Display):
         data: tuple[Tensor, Tensor] | None = None,
         keep: Callable[[Tensor], Tensor] | None = None,
         probability: float = 0.95,
-        num_outputs: int | None = None,
         fit: Callable[[Any], Any] | None = None,
         optimizer_options: dict[str, Any] | None = None,
         log: str | os.PathLike[str] | None = None,
@@ -190,9 +188,7 @@ class Collection(Measurements, Display):
                 f"Expected no optimizer_options with keep, got {sorted(self._options)}: keep takes "
                 "the best of random safe points. Leave the options out."
             )
-        if num_outputs is not None:
-            checked_whole("num_outputs", num_outputs, 1)
-        super().__init__(self.bounds, num_outputs, data)
+        super().__init__(self.bounds, data)
         # A model that limits points needs measurements within the limits before.
         if limits and len(self._first_points) + self.num_observed < self._initial:
             raise ValueError(
@@ -307,18 +303,14 @@ class Collection(Measurements, Display):
         Y = checked_outcomes(Y, len(X), self.num_outputs)
         self._enter([measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)])
 
-    def fail(self, X: Tensor, reason: str | Exception) -> None:
+    def fail(self, X: Tensor, reason: str) -> None:
         """Record failed measurements at points ``n x d``, which are not asked for again."""
         X = checked_points("X", X, self.bounds.shape[-1])
-        if not isinstance(reason, str):
-            reason = f"{type(reason).__name__}: {reason}"
         self._enter([{"x": x, "failed": reason} for x in X.tolist()])
 
-    def withdraw(self, X: Tensor | None = None) -> None:
-        """Withdraw some or all pending points, ``n x d``; :meth:`ask` may return them again."""
-        if X is None:
-            X = self.pending
-        self._enter([{"withdrawn": checked_points("X", X, self.bounds.shape[-1]).tolist()}])
+    def withdraw(self) -> None:
+        """Withdraw all pending points; :meth:`ask` may return them again."""
+        self._enter([{"withdrawn": self.pending.tolist()}])
 
     def run(
         self,
@@ -464,7 +456,7 @@ class Collection(Measurements, Display):
         try:
             result = oracle(X.clone())  # an oracle may change its argument
         except Exception as error:
-            self.fail(X, error)
+            self.fail(X, f"{type(error).__name__}: {error}")
             return error
         try:
             Y = checked_outcomes(result, len(X), self.num_outputs)

@@ -52,21 +52,19 @@ class Measurements:
         num_outputs: Number ``m`` of outputs; None before the first measurement.
     """
 
-    def __init__(
-        self, bounds: Tensor, num_outputs: int | None, data: tuple[Tensor, Tensor] | None
-    ) -> None:
+    def __init__(self, bounds: Tensor, data: tuple[Tensor, Tensor] | None) -> None:
         self.bounds = bounds
         # All begin with 0 x d.
         self.X = self.failed_X = self.pending = self.left_out = self._asked = bounds[:0]
-        self.Y = torch.zeros(0, num_outputs or 0, dtype=torch.float64)
+        self.Y = torch.zeros(0, 0, dtype=torch.float64)
         self.num_measured = 0
-        self.num_outputs = num_outputs
+        self.num_outputs: int | None = None
         self._num_asks = 0
         if data is not None:
             if not isinstance(data, tuple | list) or len(data) != 2:
                 raise TypeError(f"Expected data to be a pair (X, Y), got {data!r}.")
             X = checked_points("the X of data", data[0], bounds.shape[-1])
-            Y = checked_outcomes(data[1], len(X), num_outputs)
+            Y = checked_outcomes(data[1], len(X), None)
             check_observed("the Y of data", Y)
             self.X, self.Y = X, Y
             self.num_outputs = Y.shape[-1]

@@ -3,44 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
 import torch
 
 from gpadjust.active.collection import Collection
-from gpadjust.checks import checked_tensor
 from gpadjust.validation.plots import BLUE, DOTS, GREY, RED, given_axes, labels, legend, tidy
 
 __all__ = ["plot_collection"]
 
 
-def plot_collection(
-    collection: Collection, *, optimum: float | Sequence[float] | None = None, axes: Any = None
-) -> Any:
+def plot_collection(collection: Collection, *, axes: Any = None) -> Any:
     """Draw the inputs and outputs of measurements in their order, and the best outputs so far.
 
     Dots are measurements, hollow dots pending points; failed measurements are not drawn.
 
     Args:
         collection: The collection.
-        optimum: The best value of each output, or of all. Further axes then have the regret, the
-            distance of the closest measurement so far. Default: none.
-        axes: An axis for each input, output and regret, returned. Default: a new figure.
+        axes: An axis for each input and output, returned. Default: a new figure.
     """
     X, Y, pending = collection.X, collection.Y, collection.pending
     n, d, m = len(X), X.shape[-1], Y.shape[-1]
-    best = [] if optimum is None else checked_tensor("optimum", optimum).reshape(-1).tolist()
-    if len(best) == 1:
-        best = best * m
-    if len(best) not in (0, m) or not all(map(math.isfinite, best)):
-        raise ValueError(f"Expected optimum as {m} finite numbers, one of each output; got {best}.")
-    rows = d + m + len(best)
     if axes is None:
-        figure = plt.figure(figsize=(6, 1.6 * rows), layout="constrained")
-        axes = figure.subplots(rows, 1, sharex=True, squeeze=False)
-    axes = given_axes(axes, (rows,))
+        figure = plt.figure(figsize=(6, 1.6 * (d + m)), layout="constrained")
+        axes = figure.subplots(d + m, 1, sharex=True, squeeze=False)
+    axes = given_axes(axes, (d + m,))
     # Inputs first, with their bounds and pending points.
     numbers = torch.arange(1, n + len(pending) + 1)
     for i, ax in enumerate(axes[:d]):
@@ -48,20 +36,15 @@ def plot_collection(
             ax.axhline(bound, color=GREY, lw=0.8, ls=":")
         ax.plot(numbers[:n], X[:, i], color=BLUE, **DOTS)
         ax.plot(numbers[n:], pending[:, i], color=BLUE, **DOTS | {"mfc": "none", "mec": BLUE})
-    for values, ax in zip(Y.mT, axes[d : d + m], strict=True):
+    for values, ax in zip(Y.mT, axes[d:], strict=True):
         # A missing output is neither the lowest nor the highest.
         lowest = values.nan_to_num(nan=math.inf).cummin(0).values
         highest = values.nan_to_num(nan=-math.inf).cummax(0).values
         ax.plot(numbers[:n], values, color=GREY, **DOTS)
         for curve, color, label in ((highest, RED, "highest"), (lowest, BLUE, "lowest")):
             ax.step(numbers[:n], curve, where="post", color=color, label=f"{label} so far")
-    for values, value, ax in zip(Y.mT, best, axes[d + m :], strict=False):
-        # min |y - optimum| so far
-        regret = (values - value).abs().nan_to_num(nan=math.inf).cummin(0).values
-        ax.step(numbers[:n], regret, where="post", color=BLUE)
-        ax.set_yscale("log")
     names = [*labels([f"x{i + 1}" for i in range(d)]), *labels([f"y{j + 1}" for j in range(m)])]
-    for ax, label in zip(axes, [*names, *(f"regret of {y}" for y in names[d:])], strict=False):
+    for ax, label in zip(axes, names, strict=True):
         ax.set_ylabel(label)
         tidy(ax)
     if m:

@@ -18,7 +18,7 @@ from gpadjust.dynamics.base import Dynamics, Sampler, TransitionFunctions
 from gpadjust.dynamics.least_squares import most_likely
 from gpadjust.dynamics.state import check_numbers, columns_of, fingerprint, loading
 from gpadjust.dynamics.trajectories import Trajectories
-from gpadjust.physics import ODEPhysics, Physics, PhysicsError, as_physics
+from gpadjust.physics import Physics, PhysicsError, as_physics
 from gpadjust.physics.parameters import PhysicsParameters, even_normal
 from gpadjust.states import StateSpec
 
@@ -281,11 +281,6 @@ def named_physics(physics: Any, spec: StateSpec) -> dict[str, Physics]:
             if isinstance(physics, Mapping):
                 part.name = name
         parts[name] = part
-        if isinstance(part, ODEPhysics) and part.difference:
-            raise ValueError(
-                f"Physics {part.name!r} returns the change of the state (difference=True), but "
-                "dynamics need the next state; build it with difference=False."
-            )
         steps = [step for step in (part.step, spec.step) if step is not None]
         if len(steps) == 2 and not math.isclose(*steps, rel_tol=1e-6):
             raise ValueError(

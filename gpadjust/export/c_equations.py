@@ -181,11 +181,7 @@ def physics_lines(
         parameters=passed,
         h=repr(ode.step / ode.substeps),
     ).rstrip()
-    for i in range(ode.state_dim):
-        mean = f"at[{i}]"
-        if ode.difference:
-            mean += f" - {x[i]}"
-        yield f"    mean[{i}] = {mean};"
+    yield from (f"    mean[{i}] = at[{i}];" for i in range(ode.state_dim))
     yield "}\n"
 
 

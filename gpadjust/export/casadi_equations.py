@@ -59,7 +59,7 @@ def physics_function(equations: Equations, name: str, free: bool = False) -> Any
     if ode is None:
         mean = outputs(columns)
     else:
-        start = mean = ca.vertcat(*columns[: ode.state_dim])
+        mean = ca.vertcat(*columns[: ode.state_dim])
         action = columns[ode.state_dim :]
         for _ in range(ode.substeps):
             begin = mean
@@ -70,8 +70,6 @@ def physics_function(equations: Equations, name: str, free: bool = False) -> Any
                 mean = begin
                 for weight, slope in zip(weights, slopes, strict=True):
                     mean = mean + ode.step / ode.substeps * weight * slope
-        if ode.difference:
-            mean = mean - start
     return ca.Function(name, [*arguments.values()], [mean], [*arguments], ["mean"])
 
 

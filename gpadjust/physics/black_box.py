@@ -202,9 +202,7 @@ class FiniteDifferences(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, rows: Tensor, Y: Tensor, physics: Physics, step: float | None = None
-    ) -> Tensor:
+    def forward(ctx: Any, rows: Tensor, Y: Tensor, physics: Physics, step: float | None) -> Tensor:
         """Return the outputs."""
         ctx.save_for_backward(rows)
         ctx.physics, ctx.step = physics, step

@@ -89,7 +89,6 @@ class FMU:
     def simulate(
         self,
         values: Mapping[str, float],
-        start: float,
         times: Array,
         outputs: Sequence[str],
         signals: Mapping[str, Array],
@@ -101,17 +100,17 @@ class FMU:
 
         changes = signals["time"]
         end = stop = float(times.max())  # the latter limits the steps of a solver
-        points = np.unique([start, *times, *changes[(start < changes) & (changes < end)]])
-        step = step or self.step or end - start or 1.0  # of one moment any step will do
+        points = np.unique([0.0, *times, *changes[(changes > 0) & (changes < end)]])
+        step = step or self.step or end or 1.0  # of one moment any step will do
         if self.kind == "ModelExchange":
-            step = (end - start) / _INTERVALS or 1.0
-            stop = start + _LONGER * (end - start)
+            step = end / _INTERVALS or 1.0
+            stop = _LONGER * end
         names = {*values, *outputs, *signals}
         description = copy(self.description)  # FMPy goes through all variables of one
         description.modelVariables = [v for v in self.variables.values() if v.name in names]
 
         def is_before_end(time: float, recorder: Any) -> bool:
-            if time < end - _SAME * (end - start):
+            if time < end - _SAME * end:
                 return True
             recorder.sample(time)
             return False
@@ -125,7 +124,7 @@ class FMU:
                     fmu_instance=self._begun(values),
                     fmi_type=self.kind,
                     validate=False,
-                    start_time=start,
+                    start_time=0.0,
                     stop_time=stop,
                     set_stop_time=stop == end,
                     step_finished=is_before_end,

@@ -22,8 +22,8 @@ from gpadjust.physics.unknown import Unknown
 class FMUPhysics(BlackBoxPhysics):
     r"""Physics given as an FMU of FMI 2 or 3, the file in which simulation programs export a model.
 
-    Each row is a simulation by `FMPy <https://github.com/CATIA-Systems/FMPy>`_ from ``start_time``
-    to the last of the ``times``, with the row's inputs as start values:
+    Each row is a simulation by `FMPy <https://github.com/CATIA-Systems/FMPy>`_ from time 0 to the
+    last of the ``times``, with the row's inputs as start values:
 
     - A simulator: inputs are parameters and constant inputs of the FMU.
     - Dynamics: inputs are states and actions, outputs the states, ``times`` the control step. A
@@ -44,7 +44,6 @@ class FMUPhysics(BlackBoxPhysics):
         signals: Inputs of the FMU over time: a frame or mapping with ``"time"``, ascending, and a
             column for each of them. A value holds until the next, and the first before.
         unknowns: Unknown parameters by their names in the FMU, whose units they take.
-        start_time: The time at which simulations begin.
         communication_step: The steps of co-simulation, which end at ``times`` and ``signals``, too.
             Default: the step that the FMU proposes, or none between these times.
         tolerance: The relative tolerance of model exchange; a wish to the FMU in co-simulation.
@@ -80,7 +79,6 @@ class FMUPhysics(BlackBoxPhysics):
         start_values: Mapping[str, float] | None = None,
         signals: Any = None,
         unknowns: Mapping[str, Unknown] | None = None,
-        start_time: float = 0.0,
         communication_step: float | None = None,
         tolerance: float = 1e-8,
         kind: Literal["CoSimulation", "ModelExchange"] | None = None,
@@ -115,11 +113,10 @@ class FMUPhysics(BlackBoxPhysics):
         self.input_names, self.output_names = tuple(inputs), tuple(outputs)
         self.start_values = {k: checked_number(k, v) for k, v in (start_values or {}).items()}
         self.signals = _signals(signals)
-        self.start_time = checked_number("start_time", start_time)
         self.times: tuple[float, ...] = ()
         if times is not None:
             numbers = np.atleast_1d(real_array(times)).tolist()
-            self.times = tuple(checked_number("times", t, least=self.start_time) for t in numbers)
+            self.times = tuple(checked_number("times", t, least=0) for t in numbers)
         self.communication_step = communication_step
         self.tolerance = checked_number("tolerance", tolerance, above=0, below=1)
         if self.inputs is None:
@@ -161,11 +158,10 @@ class FMUPhysics(BlackBoxPhysics):
         times = np.tile(self.times, (len(rows), 1))  # N x times of a row
         if values.pop("time", None) is not None:
             times = rows[:, [self.input_names.index("time")]]
-        if times.min() < self.start_time:
-            raise ValueError(f"expected times from start_time={self.start_time:g} on")
+        if times.min() < 0:
+            raise ValueError(f"expected times of 0 or later, found {times.min():g}")
         outputs = opened(self.path, self.kind).simulate(
             self.start_values | values,
-            self.start_time,
             times.ravel(),
             self.output_names,
             self.signals,

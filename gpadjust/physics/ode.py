@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from gpadjust.checks import check_choice, checked_number, checked_whole
 from gpadjust.physics.base import Physics, name_of
-from gpadjust.physics.black_box import FiniteDifferences
 from gpadjust.physics.error import PhysicsError, outline
 from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.parameters import ParameterValues
@@ -30,9 +28,7 @@ class ODEPhysics(Physics):
 
     With :math:`x = (s, a)`, a state and an action that is held during the step :math:`h`,
 
-    .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s,
-
-    or :math:`s(h) - s` with ``difference=True``.
+    .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s.
 
     Args:
         rhs: The time derivative :math:`g`, a function of state ``N x state_dim``, action ``N x a``
@@ -43,9 +39,6 @@ class ODEPhysics(Physics):
         substeps: Integration steps within the step.
         method: ``"euler"``, ``"midpoint"`` or ``"rk4"`` (Kutta's 3/8 rule). An adaptive method is
             ``torchdiffeq.odeint`` in a :class:`FunctionPhysics`.
-        difference: If True, the output is the change of the state instead of the new state.
-        gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, without
-            second derivatives, which is several times faster if there are many substeps.
         unknowns, inputs, name: As of :class:`Physics`.
 
     Example:
@@ -64,9 +57,7 @@ class ODEPhysics(Physics):
         *,
         substeps: int = 10,
         method: str = "rk4",
-        difference: bool = False,
         unknowns: Mapping[str, Unknown] | None = None,
-        gradient: Literal["autograd", "finite-difference"] = "autograd",
         inputs: Sequence[int] | None = None,
         name: str | None = None,
     ) -> None:
@@ -75,12 +66,10 @@ class ODEPhysics(Physics):
             name = name or rhs.name
         super().__init__(unknowns=unknowns, inputs=inputs, name=name_of(rhs, name, "rhs"))
         check_choice("method", method, tuple(METHODS))
-        check_choice("gradient", gradient, ("autograd", "finite-difference"))
-        self.rhs, self.method, self.gradient = rhs, method, gradient
+        self.rhs, self.method = rhs, method
         self.step = checked_number("step", step, above=0)
         self.state_dim = self.num_outputs = checked_whole("state_dim", state_dim, 1)
         self.substeps = checked_whole("substeps", substeps, 1)
-        self.difference = difference
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if the equations are a text, and data have another order."""
@@ -88,7 +77,7 @@ class ODEPhysics(Physics):
             self.rhs.check_names(names)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the state after the step or its change, ``N x state_dim``."""
+        """Return the state after the step, ``N x state_dim``."""
         state, action = X[:, : self.state_dim], X[:, self.state_dim :]
 
         def derivative(state: Tensor) -> Tensor:
@@ -118,12 +107,4 @@ class ODEPhysics(Physics):
                     if weight:
                         point = point.add(slope, alpha=h * weight)
             end = point
-        return end - state if self.difference else end
-
-    def of_rows(self, rows: Tensor) -> Tensor:
-        """Return the outputs of rows, with the gradient in X by differences if that was chosen."""
-        # Differences in X would cut off the gradient of the parameters of a module.
-        learns = any(p.requires_grad for p in self.parameters())
-        if self.gradient == "autograd" or learns or not rows.requires_grad:
-            return super().of_rows(rows)
-        return FiniteDifferences.apply(rows, super().of_rows(rows.detach()), self)
+        return end

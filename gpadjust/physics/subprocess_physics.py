@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import signal
 import subprocess
@@ -11,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from string import Formatter
-from uuid import uuid4
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,8 +25,9 @@ class SubprocessPhysics(BlackBoxPhysics):
     (``{T:.3f}``; by default all digits), and ``{{`` is a brace. The outputs are the printed
     numbers. If the exit code is not 0, the row fails, with the program's stderr in the error.
 
-    Rows run in parallel and are remembered as of a :class:`~gpadjust.BlackBoxPhysics`. There is no
-    gradient in X, as programs seldom print the digits that differences need.
+    Rows run in parallel and are remembered as of a :class:`~gpadjust.BlackBoxPhysics`, by the
+    process; ``joblib.Memory`` keeps outputs of a function on the disk. There is no gradient in X,
+    as programs seldom print the digits that differences need.
 
     Args:
         command: The program and its arguments, ``["prog", "--temperature", "{T}"]``; no shell.
@@ -37,8 +35,6 @@ class SubprocessPhysics(BlackBoxPhysics):
         stdin: A text with placeholders for the program's standard input. Default: nothing.
         parse: Maps the printed text to the outputs. Default: numbers between blanks or commas.
         timeout: Seconds after which a run is ended, and has failed. Default: none.
-        cache: A folder that keeps outputs, by command and ``stdin``, for all processes that use it;
-            a failure is not kept. Remove it when the program itself has changed.
         unknowns, inputs, name: As of :class:`Physics`; each unknown parameter has a placeholder.
 
     Example:
@@ -58,7 +54,6 @@ class SubprocessPhysics(BlackBoxPhysics):
         stdin: str = "",
         parse: Callable[[str], ArrayLike] | None = None,
         timeout: float | None = None,
-        cache: str | Path | None = None,
         inputs: Sequence[int] | None = None,
         name: str | None = None,
     ) -> None:
@@ -83,7 +78,6 @@ class SubprocessPhysics(BlackBoxPhysics):
         self.stdin = stdin
         self.parse = parse or _numbers
         self.timeout = timeout
-        self.cache = None if cache is None else Path(cache).absolute()
 
     def _run(self, row: NDArray[np.float64], *parameters: Mapping[str, float]) -> ArrayLike:
         """Return the outputs at a row of inputs."""
@@ -94,23 +88,8 @@ class SubprocessPhysics(BlackBoxPhysics):
         for values_of_parameters in parameters:
             named |= values_of_parameters
         command = [part.format(*values, **named) for part in self.command]
-        return self.parse(self._output(command, self.stdin.format(*values, **named)))
-
-    def _output(self, command: list[str], stdin: str) -> str:
-        """Return the printed text, from the cache if it is there."""
-        if self.cache is None:
-            return _printed(command, stdin, self.timeout)
-        run = {"command": command, "stdin": stdin or None}
-        key = hashlib.sha256(json.dumps(run).encode()).hexdigest()
-        file = self.cache / f"{key}.json"
-        with suppress(OSError, ValueError, KeyError):  # without a file, or with a damaged one
-            return str(json.loads(file.read_text(encoding="utf-8"))["stdout"])
-        text = _printed(command, stdin, self.timeout)
-        self.cache.mkdir(parents=True, exist_ok=True)
-        part = self.cache / f"{key}.{uuid4().hex}.part"
-        part.write_text(json.dumps({**run, "stdout": text}), encoding="utf-8")
-        part.replace(file)  # at once, as other processes may read or write it now
-        return text
+        text = _printed(command, self.stdin.format(*values, **named), self.timeout)
+        return self.parse(text)
 
 
 def _numbers(text: str) -> list[float]:

@@ -163,53 +163,34 @@ def test_it_is_the_expected_kullback_leibler_divergence(about):
     assert abs(divergence.mean() - value) < 4 * error
 
 
-class TestLaws:
-    def test_more_points_teach_more_but_less_each_in_any_order(self):
-        model = made(num_draws=2)
-        for about in ABOUT:
-            one, two, three = (gain(model, Z[:k], about) for k in (1, 2, 3))
-            assert one < two < three
-            assert_close(gain(model, Z[[2, 0, 1]], about), three)
-        assert two <= one + gain(model, Z[1:2])
-        both, rho, delta = (gain(model, Z, about) for about in ("both", "rho", "delta"))
-        assert both > torch.maximum(rho, delta)
+def test_more_points_teach_more_but_less_each_in_any_order():
+    model = made(num_draws=2)
+    more = model.condition_on_observations(Z[:1], torch.ones(1, 1).double())
+    for about in ABOUT:
+        one, two, three = (gain(model, Z[:k], about) for k in (1, 2, 3))
+        assert one < two < three
+        assert_close(gain(model, Z[[2, 0, 1]], about), three)
+        assert_close(one + gain(more, Z[1:], about), three)  # I(a, b) = I(a) + I(b | a)
+    assert two <= one + gain(model, Z[1:2])
+    both, rho, delta = (gain(model, Z, about) for about in ("both", "rho", "delta"))
+    assert both > torch.maximum(rho, delta)
 
-    def test_units_do_not_matter(self):
-        expected = gain(made(), Z, "rho")
-        for unit in (1e-6, 1e5):
-            other = CKA(
-                D / unit, Y[:, :1] * unit, center=0.0,
-                physics=lambda X, unit=unit: unit * crude(X * unit)[..., :1],
-            )  # fmt: skip
-            other.set_draws(made().u.detach())
-            assert_close(gain(other, Z / unit, "rho"), expected, 1e-6)
 
-    def test_a_repeated_measurement_without_noise_teaches_nothing(self):
-        for noise, least, most in ((1e-12, 0, 1e-2), (1e12, 0, 1e-6)):
-            model = made(Yvar=noise)
-            again, elsewhere = gain(model, D[:1], "rho"), gain(model, D[:1] + 0.5, "rho")
-            assert least <= again < most * (elsewhere if noise < 1 else 1)
-
-    def test_where_the_physics_is_zero_it_tells_of_delta_alone(self):
-        model = made(physics=lambda X: 0 * X[..., :1])
-        assert_close(gain(model, Z, "rho"), 0.0)
-        assert_close(gain(model, Z, "delta"), gain(model, Z, "both"))
-
-    def test_a_draw_of_a_nested_model_without_the_physics_teaches_nothing_of_rho(self):
-        model = made(num_draws=2)
-        u = model.table.with_choice(model.u.detach(), 2)
-        assert model.table.choices[2].text == "of no use"
-        model.set_draws(torch.cat([model.u.detach(), u]))
-        whole = gain(made(num_draws=2), Z, "rho")
-        assert_close(gain(model, Z, "rho"), whole / 2)
-
-    def test_after_conditioning(self):
-        model = made(num_draws=2)
-        for about in ABOUT:
-            more = model.condition_on_observations(Z[:1], torch.ones(1, 1).double())
-            assert_close(
-                gain(model, Z[:1], about) + gain(more, Z[1:], about), gain(model, Z, about)
-            )
+def test_limiting_cases():
+    """A repeated measurement without noise, or with much; f_p = 0; draws without f_p."""
+    for noise, most in ((1e-12, 1e-2), (1e12, 1e-6)):
+        model = made(Yvar=noise)
+        again, elsewhere = gain(model, D[:1], "rho"), gain(model, D[:1] + 0.5, "rho")
+        assert 0 <= again < most * max(elsewhere, 1)
+    model = made(physics=lambda X: 0 * X[..., :1])
+    assert_close(gain(model, Z, "rho"), 0.0)
+    assert_close(gain(model, Z, "delta"), gain(model, Z, "both"))
+    model = made(num_draws=2)
+    whole = gain(model, Z, "rho")
+    assert model.table.choices[2].text == "of no use"
+    u = model.u.detach()
+    model.set_draws(torch.cat([u, model.table.with_choice(u, 2)]))
+    assert_close(gain(model, Z, "rho"), whole / 2)
 
 
 def test_batches_pending_points_and_input_transforms():
@@ -264,7 +245,6 @@ REFUSED = [
     (lambda: made(ZeroMeanGP), "both", TypeError, "rho or delta.* found ZeroMeanGP"),
     (lambda: made(CalibratedPhysics, physics=LAW), "both", TypeError, "has neither rho nor delta"),
     (lambda: made(center=True), "delta", ValueError, "use about='rho' or 'both', .* center=0"),
-    (lambda: made(center=2.0), "delta", ValueError, "use about='rho' or 'both', .* center=0"),
     (lambda: made(VariationalCKA, num_inducing=5), "rho", TypeError, "rho: use about='both'"),
     (made, "epsilon", ValueError, r"about='epsilon'; expected 'rho'"),
     (lambda: ModelListGP(made()), "both", TypeError, "found ModelListGP"),

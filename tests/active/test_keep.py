@@ -87,7 +87,7 @@ def test_an_interrupted_run_goes_on_with_what_was_left_out(tmp_path):
 
 
 class Nearest(AcquisitionFunction):
-    """Which is best at 0.5, and notes what is pending when it is asked."""
+    """Best at 0.5; it notes the pending points."""
 
     def __init__(self, own=None):
         super().__init__(torch.nn.Module())
@@ -135,7 +135,6 @@ def test_points_of_a_batch_are_apart_and_none_of_them_is_left_out(harmless):
 SAFE = {"initial": [[0.1], [0.2]]}
 UNSAFE = {"data": (torch.tensor([[0.0], [0.5], [1.0]]), torch.tensor([[5.0], [6.0], [5.0]]))}
 REFUSED = [
-    ({}, ValueError, "first points must be known as safe"),
     ({"initial": [[0.1]]}, ValueError, "first points must be known as safe.*found 1 and 0"),
     ({**SAFE, "probability": 95}, ValueError, "probability must be"),
     ({**SAFE, "keep": 1.5}, TypeError, "keep to be callable"),

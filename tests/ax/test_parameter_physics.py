@@ -13,7 +13,7 @@ PARAMETERS = ["x1", "x2", "x3"]
 
 class Network(torch.nn.Module):
     def forward(self, x1):
-        return x1[:, :1]
+        return x1
 
 
 def test_arguments_with_names_of_parameters_are_these():
@@ -31,6 +31,7 @@ def test_arguments_with_names_of_parameters_are_these():
     for physics in (lambda x1, z: x1, lambda a, b: a, lambda x1, z, *, y=0: x1):
         words = r"not a parameter of the search space, which has x1, x2"
         refused(ValueError, words, ParameterPhysics(physics).read_names, PARAMETERS)
+    refused(TypeError, "physics must be a Physics or a callable", ParameterPhysics, 3.0)
 
 
 def test_it_is_given_values_by_name():
@@ -51,11 +52,6 @@ def test_what_it_remembers_outlives_models():
     for each in (physics, deepcopy(physics), physics):
         each.take_rows(("x1",))(rows)
     assert calls == [4]
-
-
-def test_what_is_no_physics_is_an_error():
-    for physics in (3.0, torch.nn.Linear, None):
-        refused(TypeError, "physics must be a Physics or a callable", ParameterPhysics, physics)
 
 
 def test_it_is_told_by_its_path():

@@ -10,7 +10,7 @@ from botorch.models import SingleTaskGP
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError
+from gpadjust.physics import FunctionPhysics, PhysicsError
 from tests.dynamics.conftest import FEW, push, pushed
 from tests.dynamics.conftest import PUSHED as SPEC
 from tests.point import assert_equal
@@ -206,8 +206,6 @@ REFUSED = [
     ({"fit_options": {"num_starts": 8}}, ValueError, "Unknown fit_option 'num_starts'"),
     ({"target": 3}, ValueError, "Unknown target 3"),
     ({"spec": ["x", "v"]}, TypeError, "spec must be a StateSpec"),
-    ({"physics": ODEPhysics(lambda s, a: s, 0.1, 2, difference=True)}, ValueError, "=False"),
-    ({"physics": [push, ODEPhysics(lambda s, a: s, 0.1, 2, difference=True)]}, ValueError, "=Fal"),
 ]
 
 

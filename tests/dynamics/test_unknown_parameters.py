@@ -23,8 +23,7 @@ def pendulum(state, action, p):
 
 
 def make_physics(**changes):
-    options = {"substeps": 2, "gradient": "finite-difference"}
-    return ODEPhysics(pendulum, 0.1, 2, unknowns={**UNKNOWNS, **changes}, **options)
+    return ODEPhysics(pendulum, 0.1, 2, unknowns={**UNKNOWNS, **changes}, substeps=2)
 
 
 def make(model=CalibratedPhysics, **changes):

@@ -38,15 +38,13 @@ def with_missing():
     return torch.cat([some, some + 0.01])
 
 
-def scaled(X, p):
-    return p.factor[:, None] * crude(X)
-
-
 def one(X):
     return crude(X)[..., :1]
 
 
-LAW = FunctionPhysics(scaled, unknowns={"factor": Unknown(1.0, sd=0.5)})
+LAW = FunctionPhysics(
+    lambda X, p: p.factor[:, None] * crude(X), unknowns={"factor": Unknown(1.0, sd=0.5)}
+)
 KERNELS = {"rho_covar_module": Stationary(MATERN12), "delta_covar_module": Stationary(MATERN32)}
 MODELS = {
     "CKA": lambda: CKA(X, Y, physics=crude),

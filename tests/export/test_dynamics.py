@@ -123,18 +123,6 @@ def test_casadi_has_the_slopes_of_the_mean():
     torch.testing.assert_close(torch.tensor(found), expected, rtol=1e-8, atol=1e-10)
 
 
-def test_one_unit_may_contain_several_dynamics_also_without_variance(tmp_path):
-    dynamics = [learnt(), learnt("absolute", RRA20)]
-    code = [c_source(each, f"d{i}") for i, each in enumerate(dynamics)]
-    code.append(c_source(dynamics[0], "d2", variance=False))
-    program = compiled("".join(code), tmp_path)
-    expected = [each.predict(STATE, ACTION).mean for each in dynamics]
-    for i, mean in enumerate([*expected, expected[0]]):
-        sizes = (6, 6)[: 1 + (i < 2)]
-        found = called(getattr(program, f"d{i}_step"), sizes, STATE, ACTION, F_P)[0]
-        torch.testing.assert_close(found, mean, rtol=1e-9, atol=1e-12)
-
-
 def test_a_step_in_place_is_that_into_another_array(tmp_path):
     """Each entry but the first is made of one that is written before it."""
     spec = StateSpec(

@@ -1,6 +1,7 @@
 """Programs of a physics that is written in formulas."""
 
 import functools
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -8,12 +9,7 @@ import torch
 from gpadjust import CKA
 from gpadjust.dynamics import IdentifiedDynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.export import c_source, casadi_function
-from gpadjust.physics import (
-    FormulaPhysics,
-    ODEPhysics,
-    PhysicsParameters,
-    Unknown,
-)
+from gpadjust.physics import FormulaPhysics, ODEPhysics, PhysicsParameters, Unknown
 from gpadjust.states import StateSpec
 from tests.export.apart import apart
 from tests.export.conftest import called, compiled, in_casadi
@@ -42,7 +38,7 @@ PHYSICS = {
     "everything": FormulaPhysics(EVERYTHING, ["x", "v"]),
     "spring": SPRING,
     "rk4": ODEPhysics(SPRING, 0.1, 2, substeps=3),
-    "midpoint, change": ODEPhysics(SPRING, 0.1, 2, substeps=2, method="midpoint", difference=True),
+    "midpoint": ODEPhysics(SPRING, 0.1, 2, substeps=2, method="midpoint"),
     "euler, columns": ODEPhysics(SPRING, 0.1, 2, method="euler", inputs=[2, 0, 1]),
     "curves": ODEPhysics(CURVED, 0.1, 2, substeps=2),
 }
@@ -77,21 +73,14 @@ def dynamics(name):
 
 
 @pytest.mark.parametrize("name", PHYSICS)
-def test_c_says_what_the_physics_says(name, tmp_path):
-    physics = PHYSICS[name]
-    X = points(physics)
-    program = compiled(c_source(physics, "law"), tmp_path)
-    for x, y in zip(X, physics(X), strict=True):
-        same(called(program.law_predict, y.shape, x), [y])
-
-
-@pytest.mark.parametrize("name", PHYSICS)
 @apart
-def test_casadi_says_what_the_physics_says(name):
+def test_programs_say_what_the_physics_says(name, tmp_path):
     physics = PHYSICS[name]
     X, function = points(physics), casadi_function(physics)
     assert (function.name_in(), function.name_out()) == (["x"], ["mean"])
+    program = compiled(c_source(physics, "law"), tmp_path)
     for x, y in zip(X, physics(X), strict=True):
+        same(called(program.law_predict, y.shape, x), [y])
         same(in_casadi(function, x), [y])
 
 
@@ -132,15 +121,6 @@ def test_curves_may_have_the_names_of_other_functions(tmp_path):
         same(called(program.law_predict, (1,), x), [physics(x[None])[0]])
 
 
-def test_one_unit_may_contain_several_programs(tmp_path):
-    code = c_source(PHYSICS["curves"], "a") + c_source(dynamics("rk4"), "b")
-    program = compiled(code + c_source(PHYSICS["everything"], "c"), tmp_path)
-    for name, physics in (("a", PHYSICS["curves"]), ("c", PHYSICS["everything"])):
-        x = points(physics)[:1]
-        y = physics(x)[0]
-        same(called(getattr(program, f"{name}_predict"), y.shape, x[0]), [y])
-
-
 @functools.cache
 def learnt():
     """Dynamics and a model whose physics is written, and what they predict."""
@@ -163,12 +143,16 @@ def learnt():
 def test_a_model_has_its_written_physics_within(tmp_path):
     found, model = learnt()
     x, state, action = uniform(1, 1, seed=3), normal(1, 2, seed=3), normal(1, 1, seed=4)
-    program = compiled(c_source(model, "m") + c_source(found, "d"), tmp_path)
-    for name, own, given in (
-        ("m_predict", model, [x]),
-        ("d_step", found, [state, action]),
+    code = c_source(model, "m") + c_source(found, "d") + c_source(PHYSICS["curves"], "p")
+    program = compiled(code + c_source(found, "d_mean", variance=False), tmp_path)
+    predicted = found.predict(state[0], action[0]).mean
+    (mean,) = called(program.d_mean_step, (2,), state[0], action[0])
+    torch.testing.assert_close(mean, predicted, rtol=1e-9, atol=1e-9)
+    noise = {"observation_noise": False}
+    for name, own, given, options in (
+        ("m_predict", model, [x], {}),
+        ("d_step", found, [state, action], noise),
     ):
-        options = {} if own is model else {"observation_noise": False}
         mean, variance = (part[0] for part in own.predict(*given, **options))
         rows = [each[0] for each in given]
         in_c = called(getattr(program, name), 2 * (mean.numel(),), *rows)
@@ -177,11 +161,6 @@ def test_a_model_has_its_written_physics_within(tmp_path):
             torch.testing.assert_close(values[1], variance, rtol=1e-7, atol=1e-9)
 
 
-class Found:
-    """What has dynamics, as an identification."""
-
-    dynamics = PhysicsDynamics(StateSpec(["x", "v"], ["u"]), PHYSICS["rk4"])
-
-
 def test_of_an_identification_the_dynamics_are_exported():
-    assert c_source(Found(), "a") == c_source(Found.dynamics, "a")
+    step = PhysicsDynamics(StateSpec(["x", "v"], ["u"]), PHYSICS["rk4"])
+    assert c_source(SimpleNamespace(dynamics=step), "a") == c_source(step, "a")

@@ -26,7 +26,6 @@ TANK = [
     ("wall[1].C", "J/K", "parameter", *CONSTANT, 1000, 0),
     ("loss", "W/K", "parameter", *CONSTANT, 10, 0),
     ("wall_start", "K", "parameter", *CONSTANT, 0, 0),
-    ("walls", "", "parameter", *CONSTANT, 1, 0),
 ]
 BALL = [
     ("h", "m", "output", *STATE, 1, 0),
@@ -36,6 +35,7 @@ BALL = [
     ("e", "", "parameter", *CONSTANT, 0.7, 0),
     ("g", "m/s2", "parameter", *CONSTANT, 9.81, 0),
 ]
+WEAK = "__attribute__((weak))"
 MODELS = {"tank": (1, TANK, 0), "ball": (2, BALL, 1)}
 
 
@@ -51,35 +51,27 @@ def description(name, fmi, variables, number, indicators, interface):
         f"<CoSimulation{attributes(modelIdentifier=name, **interface['any'], **interface['cs'])}/>"
     )
     units = "".join(f'<Unit name="{unit}"/>' for unit in sorted({v[1] for v in variables} - {""}))
-    outputs = [i for i, v in enumerate(variables) if v[2] == "output"]
     rates = [i for i, v in enumerate(variables) if v[6]]
-    unknown = [i for i, v in enumerate(variables) if v[4] in ("calculated", "approx")]
-    text = structure = ""
+    text = ""
     for i, (own, unit, causality, variability, initial, start, rate) in enumerate(variables):
         about = {"name": own, "valueReference": i, "causality": causality}
         about |= {"variability": variability, "initial": initial}
         value = {"unit": unit, "start": None if initial == "calculated" else start}
+        if rate:
+            value["derivative"] = rate if fmi == 2 else rate - 1
         if fmi == 2:
-            value["derivative"] = rate or ""
-            kind = "Integer" if own == "walls" else "Real"
-            real = f"<{kind}{attributes(**value)}/>"
+            real = f"<Real{attributes(**value)}/>"
             text += f"<ScalarVariable{attributes(**about)}>{real}</ScalarVariable>"
         else:
-            value["derivative"] = rate - 1 if rate else ""
-            kind = "Int32" if own == "walls" else "Float64"
-            text += f"<{kind}{attributes(**about, **value)}/>"
+            text += f"<Float64{attributes(**about, **value)}/>"
     if fmi == 2:
-        tags = {"Outputs": outputs, "Derivatives": rates, "InitialUnknowns": unknown}
-        for tag, places in tags.items():
-            entries = "".join(f'<Unknown index="{i + 1}"/>' for i in places)
-            structure += f"<{tag}>{entries}</{tag}>"
+        entries = "".join(f'<Unknown index="{i + 1}"/>' for i in rates)
+        structure = f"<Derivatives>{entries}</Derivatives>"
         head = {"fmiVersion": "2.0", "guid": number, "numberOfEventIndicators": indicators}
     else:
         about = {"name": "time", "valueReference": 99, "causality": "independent"}
         text += f"<Float64{attributes(**about, variability='continuous')}/>"
-        tags = {"Output": outputs, "ContinuousStateDerivative": rates, "InitialUnknown": unknown}
-        for tag, places in tags.items():
-            structure += "".join(f'<{tag} valueReference="{i}"/>' for i in places)
+        structure = "".join(f'<ContinuousStateDerivative valueReference="{i}"/>' for i in rates)
         structure += '<EventIndicator valueReference="0"/>' * indicators
         head = {"fmiVersion": "3.0", "instantiationToken": number}
     return (
@@ -87,6 +79,14 @@ def description(name, fmi, variables, number, indicators, interface):
         f"<UnitDefinitions>{units}</UnitDefinitions><ModelVariables>{text}</ModelVariables>"
         f"<ModelStructure>{structure}</ModelStructure></fmiModelDescription>"
     )
+
+
+def functions(fmi):
+    """All functions of FMI that FMPy looks for."""
+    from fmpy import fmi2, fmi3
+
+    kinds = {2: (fmi2.FMU2Slave, fmi2.FMU2Model), 3: (fmi3.FMU3Slave, fmi3.FMU3Model)}[fmi]
+    return sorted({name for kind in kinds for name in dir(kind) if name.startswith(f"fmi{fmi}")})
 
 
 @functools.cache
@@ -101,8 +101,12 @@ def fmu(name="tank", fmi=2, *, only_one=False, any_step=True, of=None, initial=N
     headers = Path(fmpy.__file__).parent / "c-code"
     options = [f"-DFMI={fmi}", f"-DMODEL={number}", f"-DONLY_ONE={int(only_one)}", f"-I{headers}"]
     command = [compiler, "-std=c99", "-O1", "-shared", "-fPIC", *options]
-    source = Path(__file__).with_name("model.c")
-    subprocess.run([*command, "-o", library, source, "-lm"], check=True)
+    sources = [Path(__file__).with_name("model.c"), folder / "others.c"]
+    # Functions of model.c take the place of these.
+    sources[1].write_text(
+        "\n".join(f"{WEAK} int {name}() {{ return 3; }}" for name in functions(fmi))
+    )
+    subprocess.run([*command, "-o", library, *sources, "-lm"], check=True)
     interface = {
         "any": {"canBeInstantiatedOnlyOncePerProcess": str(only_one).lower()},
         "cs": {"canHandleVariableCommunicationStepSize": str(any_step).lower()},

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust import CKA, ODEPhysics, PhysicsError, Unknown, fit, load, save
-from gpadjust.control import MPC, Planner, Task
-from gpadjust.dynamics import PhysicsDynamics
+from gpadjust import ODEPhysics, PhysicsError, Unknown
 from gpadjust.physics import MujocoPhysics
 from gpadjust.records import Record, Records, identify
 from tests.systems import normal, refused, same
@@ -51,10 +49,6 @@ def arm(damping=0.05, size="0.2 0.1 0.05", mass=1.3, pos="0.2 0 0", gear=2.0, kp
       <accelerometer name="imu" site="tip"/></sensor></mujoco>"""
 
 
-def rows(n, d, seed=0):
-    return normal(n, d, seed=seed)
-
-
 def unknown(name, value):
     """A prior with this guess."""
     return Unknown(value, sd=1.0) if value <= 0 or "com" in name else Unknown(value, factor=2.0)
@@ -67,47 +61,13 @@ def test_a_pendulum_moves_as_its_equation():
         return torch.stack([rate, torque / INERTIA], dim=-1)
 
     ours = MujocoPhysics(pendulum(damping=0.1), step=0.02)
-    X = rows(9, 3)
+    X = normal(9, 3)
     X.requires_grad_(True)
     exact = ODEPhysics(rates, 0.02, 2)
     same([ours(X)], [exact(X)], rtol=0, atol=1e-7)
-    weights = rows(9, 2, seed=1)
+    weights = normal(9, 2, seed=1)
     found = [torch.autograd.grad((weights * f(X)).sum(), X)[0] for f in (ours, exact)]
     same(found[:1], found[1:], rtol=0, atol=1e-6)
-
-
-def test_a_cart_pole_moves_as_its_equations():
-    xml = """<mujoco><option timestep="0.002" integrator="RK4"/><worldbody>
-    <body name="cart"><joint name="x" type="slide" axis="1 0 0" damping="0.3"/>
-      <geom type="box" size="0.1 0.1 0.1" mass="1"/>
-      <body name="pole"><joint name="theta" axis="0 1 0"/>
-        <geom type="sphere" size="0.05" pos="0 0 0.5" mass="0.2"/>
-    </body></body></worldbody><actuator><motor name="force" joint="x"/></actuator></mujoco>"""
-
-    def rates(state, action):
-        _, theta, v, omega = state.unbind(-1)
-        s, c, m, h, own = theta.sin(), theta.cos(), 0.2, 0.5, 0.4 * 0.2 * 0.05**2
-        # M(q) q'' = forces, of the cart and about the joint of the pole
-        push = action[:, 0] - 0.3 * v + m * h * s * omega**2
-        a, b, d, turn = 1.2, m * h * c, m * h**2 + own, m * G * h * s
-        determinant = a * d - b**2
-        acceleration = (d * push - b * turn) / determinant
-        return torch.stack([v, omega, acceleration, (a * turn - b * push) / determinant], -1)
-
-    ours = MujocoPhysics(xml, step=0.02)
-    X = rows(9, 5)
-    same([ours(X)], [ODEPhysics(rates, 0.02, 4, substeps=20)(X)], rtol=0, atol=1e-6)
-    spec = ours.spec
-    assert (spec.states, spec.angles) == (("x", "theta", "x_dot", "theta_dot"), ("theta",))
-
-
-def test_energy_stays_without_damping():
-    ours, energies = MujocoPhysics(pendulum(), step=0.02), []
-    state = torch.tensor([[2.5, 1.0]]).double()
-    for _ in range(200):
-        energies.append(INERTIA * state[0, 1] ** 2 / 2 - M * G * LENGTH * state[0, 0].cos())
-        state = ours(torch.cat([state, torch.zeros(1, 1).double()], -1))
-    assert torch.stack(energies).std() < 1e-6
 
 
 def sliding(spec, p):
@@ -147,7 +107,7 @@ def test_parameters_are_those_of_an_mjcf_that_is_compiled_again(case):
     unknowns = {name: unknown(name, value) for name, value in values.items()}
     edit = sliding if case == "edit" else None
     ours = MujocoPhysics(arm(), step=0.01, unknowns=unknowns, edit=edit)
-    X = rows(5, 7)
+    X = normal(5, 7)
     again = MujocoPhysics(xml, step=0.01)(X)
     same([ours(X)], [again], rtol=0, atol=1e-9)
     assert (again - MujocoPhysics(arm(), step=0.01)(X)).abs().max() > 1e-5
@@ -177,32 +137,26 @@ def test_sheared_mass_is_that_of_moved_points():
     numbers = zip(names, A[np.triu_indices(3)].tolist(), strict=True)
     unknowns = {f"b.{name}": unknown(name, value) for name, value in numbers}
     ours = MujocoPhysics(cloud(points, '<compiler inertiafromgeom="true"/>'), unknowns=unknowns)
-    X = rows(5, 6)
+    X = normal(5, 6)
     same([ours(X)], [MujocoPhysics(cloud(moved))(X)], rtol=0, atol=1e-6)
     # Any numbers are of a body: MuJoCo's compiler refuses others.
-    wild = 3 * rows(200, 6).abs()
-    wild[:, [1, 2, 4]] *= rows(200, 3, seed=1).sign()
+    wild = 3 * normal(200, 6).abs()
+    wild[:, [1, 2, 4]] *= normal(200, 3, seed=1).sign()
     assert ours(X[:1], wild).isfinite().all()
 
 
-def test_rows_depend_neither_on_others_nor_on_threads():
-    one, two = (MujocoPhysics(arm(), step=0.01, threads=n) for n in (1, 2))
-    X = rows(400, 7)
+def test_a_row_is_a_loop_of_mujocos_steps_alone_or_beside_others_in_threads():
+    one, two = (MujocoPhysics(arm(), step=0.02, threads=n) for n in (1, 2))
+    X = normal(400, 7)
     order = torch.randperm(400)
     Y = one(X)
     assert torch.equal(two(X[order]), Y[order])
     assert len(two._data) == 2
-    alone = [MujocoPhysics(arm(), step=0.01)(x[None]) for x in X[:20]]
-    assert torch.equal(torch.cat(alone), Y[:20])
-
-
-def test_a_row_is_a_loop_of_mujocos_steps():
-    ours, X = MujocoPhysics(arm(), step=0.02), rows(3, 7)
-    for row, Y in zip(X.numpy(), ours(X), strict=True):
-        data = mujoco.MjData(ours.model)
+    for row, y in zip(X[:20].numpy(), Y, strict=False):
+        data = mujoco.MjData(one.model)
         data.qpos, data.qvel, data.act, data.ctrl = np.split(row, [2, 4, 5])
-        mujoco.mj_step(ours.model, data, 10)
-        assert Y.tolist() == [*data.qpos, *data.qvel, *data.act]
+        mujoco.mj_step(one.model, data, 10)
+        assert y.tolist() == [*data.qpos, *data.qvel, *data.act]
 
 
 def test_names_of_states_actions_and_sensors():
@@ -210,7 +164,7 @@ def test_names_of_states_actions_and_sensors():
     spec = ours.spec
     assert spec.states == ("shoulder", "elbow", "shoulder_dot", "elbow_dot", "servo_act")
     assert (spec.actions, spec.angles, spec.step) == (("motor", "servo"), ("shoulder",), 0.01)
-    sensors, states = ours.sensors(), rows(4, 5)
+    sensors, states = ours.sensors(), normal(4, 5)
     assert sensors.outputs == ("encoder", "camera_0", "camera_1", "camera_2")
     assert sensors.noise == {"encoder": 0.01}
     seen = sensors.measure(spec, states)
@@ -221,15 +175,17 @@ def test_names_of_states_actions_and_sensors():
     tip = torch.stack([x * a.cos(), 0.3 * b.sin(), -x * a.sin()], -1)
     same([seen[:, 1:]], [tip])
     assert ours.sensors(["camera"]).measure(spec, states).shape == (4, 3)
+    slide = pendulum().replace("<joint", '<joint type="slide"')
+    assert MujocoPhysics(slide).spec.angles == ()
     few = MujocoPhysics(arm(), actions=["servo"])
     assert few.spec.actions == ("servo",)
-    X = rows(3, 7)
+    X = normal(3, 7)
     X[:, 5] = 0.0
     assert torch.equal(few(X[:, [0, 1, 2, 3, 4, 6]]), MujocoPhysics(arm())(X))
 
 
-def test_pickles_copies_and_saved_models(tmp_path):
-    text, X = arm(), rows(6, 7)
+def test_pickles_and_copies(tmp_path):
+    text, X = arm(), normal(6, 7)
     (tmp_path / "arm.xml").write_text(text)
     unknowns = {"link1.mass": Unknown(1.3, factor=2.0)}
     Y = MujocoPhysics(text, step=0.01)(X)
@@ -243,13 +199,6 @@ def test_pickles_copies_and_saved_models(tmp_path):
             refused(TypeError, r"MjSpec cannot be pickled.*to_xml\(\)", pickle.dumps, ours)
         else:
             assert torch.equal(pickle.loads(pickle.dumps(ours))(X), ours(X))
-    ours, X = MujocoPhysics(pendulum()), rows(6, 3)
-    model = CKA(X, 1.1 * ours(X), physics=ours)
-    fit(model, "map")
-    with pytest.warns(UserWarning, match="Other programs cannot import the physics"):
-        save(model, tmp_path / "model.pt")
-    again = load(tmp_path / "model.pt", physics=MujocoPhysics(pendulum()))
-    same([again.predict(X).mean], [model.predict(X).mean])
 
 
 def test_unstable_rows_are_named_and_nothing_is_printed(tmp_path, monkeypatch, capfd):
@@ -258,7 +207,7 @@ def test_unstable_rows_are_named_and_nothing_is_printed(tmp_path, monkeypatch, c
     mujoco.set_mju_user_warning(said.append)
     try:
         for step in (0.002, 0.02):  # MuJoCo resets at the first step, or later
-            ours, X = MujocoPhysics(arm(), step=step, threads=2), rows(5, 7)
+            ours, X = MujocoPhysics(arm(), step=step, threads=2), normal(5, 7)
             good = ours(X)
             X[1, 2], X[3, 0] = 1e11, torch.nan
             with pytest.raises(PhysicsError, match=r"unstable.*in 2 of.*time step") as error:
@@ -269,7 +218,7 @@ def test_unstable_rows_are_named_and_nothing_is_printed(tmp_path, monkeypatch, c
             assert torch.equal(found[[0, 2, 4]], good[[0, 2, 4]])
         stiff = pendulum(option="").replace("0.002", "0.5")
         stiff = MujocoPhysics(stiff.replace('damping="0.0"', 'stiffness="1e4"'), step=50.0)
-        refused(PhysicsError, "unstable", stiff, rows(1, 3))
+        refused(PhysicsError, "unstable", stiff, normal(1, 3))
         refused(ValueError, "cannot read the model", MujocoPhysics, "no_file")
         heavy = MujocoPhysics(arm(), unknowns={"link1.mass": Unknown(1.0, factor=2.0)})
         for physics in (WITH_ONE, heavy):
@@ -283,7 +232,7 @@ def test_unstable_rows_are_named_and_nothing_is_printed(tmp_path, monkeypatch, c
 
 
 def test_a_model_that_the_caller_changes_later_is_a_copy():
-    X, changed = rows(2, 7), torch.tensor([[1.1]]).double()
+    X, changed = normal(2, 7), torch.tensor([[1.1]]).double()
     model, spec = mujoco.MjModel.from_xml_string(arm()), mujoco.MjSpec.from_string(arm())
     ours = [MujocoPhysics(source, unknowns=WITH_ONE.unknowns) for source in (model, spec)]
     before = [physics(X) for physics in ours]
@@ -293,21 +242,15 @@ def test_a_model_that_the_caller_changes_later_is_a_copy():
         same([physics(X), physics(X, changed)], [Y, WITH_ONE(X, changed)])
 
 
-@pytest.fixture
-def with_interrupts():
-    """Let Ctrl-C interrupt tests that a shell runs in the background, too."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("with_interrupts")
 def test_an_interrupt_ends_a_long_call():
-    ours, X = MujocoPhysics(arm(), step=1.0), rows(20_000, 7)  # minutes
+    ours, X = MujocoPhysics(arm(), step=1.0), normal(20_000, 7)  # minutes
+    # A shell lets tests in the background ignore Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Timer(0.3, interrupt_main).start()
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         ours(X)
+    signal.signal(signal.SIGINT, before)
     assert time.monotonic() - began < 10
     assert mujoco.get_mju_user_warning() is None
     assert ours(X[:2]).isfinite().all()
@@ -371,7 +314,7 @@ REFUSED = {
     "joints": (ValueError, "edit has changed.*njnt.*nq", of("a.b", edit=longer)),
     "function": (ValueError, "'elbow.damping' is a function. A.*number", of("elbow.damping", **OF)),
     "values": (ValueError, r"expected.* shape \(1,\)", lambda: WITH_ONE.mj_model(torch.zeros(3))),
-    "columns": (PhysicsError, "'motor', 'servo'.*found 3 c", lambda: made()()(rows(2, 3))),
+    "columns": (PhysicsError, "'motor', 'servo'.*found 3 c", lambda: made()()(normal(2, 3))),
 }
 
 
@@ -382,11 +325,11 @@ def test_refusals_name_the_way_out(case):
 
 def log_of(machine, sd, num_rows=400):
     """A log of random torques, each held for 25 rows; the rate is not measured."""
-    actions = 0.8 * rows(num_rows // 25, 1).repeat_interleave(25, 0)
+    actions = 0.8 * normal(num_rows // 25, 1).repeat_interleave(25, 0)
     states = [torch.tensor([[0.5, 0.0]]).double()]
     for action in actions[:-1, None]:
         states.append(machine(torch.cat([states[-1], action], -1)))
-    measured = torch.cat(states) + sd * rows(num_rows, 2, seed=1)
+    measured = torch.cat(states) + sd * normal(num_rows, 2, seed=1)
     times = machine.step * torch.arange(num_rows, dtype=torch.float64)
     return Records(Record(times, measured, actions), machine.spec)
 
@@ -409,29 +352,3 @@ def test_a_log_identifies_mass_and_damping():
     assert found.errors["identified"][0] < 0.007 < found.errors["guesses"][0]
     wrong = MujocoPhysics(pendulum(), step=0.02)
     refused(ValueError, "steps of 0.02.*spec has 0.01", identify, log_of(machine, 0.01), wrong)
-
-
-@pytest.mark.slow
-def test_a_set_point_is_held_after_a_trial():
-    machine = MujocoPhysics(pendulum(damping=0.1, option=""), step=0.05)
-    unknowns = {**MASS_AND_DAMPING, "hinge.damping": Unknown(0.05, factor=2.0)}
-    ours = MujocoPhysics(pendulum(option=""), step=0.05, unknowns=unknowns)
-
-    def reward(states, actions, next_states):
-        return -(next_states[:, 0] - 1.0).square() - 0.01 * next_states[:, 1].square()
-
-    task = Task(PhysicsDynamics(ours.spec, ours), reward, episode_length=20)
-    plan = Planner(horizon=0.4, rounds=2)
-    controller, errors = MPC(task, [[-4.0], [4.0]], plan, first=plan), []
-    for _ in range(2):
-        controller.reset()
-        state = torch.zeros(1, 2, dtype=torch.float64)
-        for _ in range(20):
-            action = controller.step(ours.spec.observe(state)[0].numpy())
-            state = machine(torch.cat([state, torch.as_tensor(action)[None]], -1))
-        controller.observe(ours.spec.observe(state)[0].numpy())
-        controller.learn()
-        errors.append(abs(float(state[0, 0]) - 1.0))
-    truth = torch.tensor([M, 0.1]).double()
-    same([task.dynamics.physics_parameters.mean], [truth], rtol=1e-3, atol=0)
-    assert errors[1] < min(0.03, errors[0])

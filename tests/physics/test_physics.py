@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import re
 import warnings
 
 import numpy as np
@@ -11,7 +10,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gpadjust import CalibratedPhysics
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, Physics, PhysicsError, as_physics
 from gpadjust.physics.function import array_physics
 from tests.physics.conftest import Scale
@@ -22,9 +20,9 @@ def square(X):
     return X**2
 
 
-@given(batch=st.lists(st.integers(1, 3), max_size=3), n=st.integers(1, 4), grad=st.booleans())
-def test_any_batch_shape_gives_the_plain_function(batch, n, grad):
-    X = torch.randn(*batch, n, 3, dtype=torch.float64, requires_grad=grad)
+@given(batch=st.lists(st.integers(1, 3), max_size=3), n=st.integers(1, 4))
+def test_any_batch_shape_gives_the_plain_function(batch, n):
+    X = torch.randn(*batch, n, 3, dtype=torch.float64)
     physics = FunctionPhysics(lambda X: torch.stack([X.prod(-1), X[:, 1]], -1))
     assert torch.equal(physics(X), torch.stack([X.prod(-1), X[..., 1]], -1))
 
@@ -42,25 +40,16 @@ def test_one_output_no_rows_and_columns():
     assert torch.equal(FunctionPhysics(lambda X: X, inputs=[-1, 0, -4, 3])(X), X[..., [3, 0, 0, 3]])
 
 
-@pytest.mark.parametrize("grad", [False, True])
-def test_result_has_the_dtype_of_X(grad):
-    X = torch.tensor([[1.5]], dtype=torch.float64, requires_grad=grad)
-    Y = FunctionPhysics(lambda X: X.float())(X)
-    assert Y.dtype == torch.float64
-    assert Y.requires_grad == grad
-
-
 # Gradients
 
 
-def test_gradient_in_X():
+def test_gradients_where_they_are_needed():
     physics = FunctionPhysics(lambda X: torch.stack([X.prod(-1), X[:, 0].sin()], -1))
     X = normal(2, 3, 2).requires_grad_()
     assert torch.autograd.gradcheck(physics, X)
     assert torch.autograd.gradgradcheck(physics, X)
-
-
-def test_no_graph_where_none_is_needed():
+    Y = FunctionPhysics(lambda X: X.float())(X)
+    assert (Y.dtype, Y.requires_grad) == (torch.float64, True)
     scale, X = Scale(), normal(3, 1)
     physics = FunctionPhysics(scale)
     assert physics(X).requires_grad
@@ -115,8 +104,6 @@ def test_wrong_results(grad):
         (torch.zeros(4, 1, 1), r"returned torch.float.., \(4, 1, 1\)"),
         (torch.zeros(4, 0), r"returned torch.float.., \(4, 0\)"),
         (lambda X: X.detach().numpy() ** 2, r"NumPy.*BlackBoxPhysics\("),
-        (lambda X: X.detach().numpy().sum(), r"NumPy.*BlackBoxPhysics\("),
-        (lambda X: X @ X, "raised RuntimeError: .*mat1"),
         (lambda X: X.double() * 1e308 * 1e9, "NaN or inf in 4 of 4"),
     ):
         call = function if callable(function) else lambda X, result=function: result
@@ -132,25 +119,18 @@ def test_wrong_results(grad):
     refused(PhysicsError, r"64, \(1, 1\), expected.*\(1, 2\), as before", physics, normal(3, 1))
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("grad", [False, True])
-def test_not_finite_names_rows_of_the_flattened_X(value, grad):
-    physics = FunctionPhysics(lambda X: torch.where(X > 6, value, X), name="spike")
-    X = torch.arange(9.0).reshape(3, 3, 1).requires_grad_(grad)
-    with pytest.raises(PhysicsError, match=r"'spike'.*NaN or inf in 2 of 9") as caught:
+def test_rows_are_named_for_every_copy_and_of_an_inner_physics(grad):
+    physics = FunctionPhysics(lambda X: X.log(), inputs=[0], name="spike")
+    X = torch.tensor([[1.0, 5.0], [0.0, 5.0], [-1.0, 6.0]]).requires_grad_(grad)
+    with pytest.raises(PhysicsError, match=r"'spike'.*NaN or inf in 2 of 3") as caught:
         physics(X)
-    assert caught.value.rows == (7, 8)
-    assert caught.value.inputs.tolist() == [[7.0], [8.0]]
-    assert str(caught.value).endswith("  row 7: [7.0]\n  row 8: [8.0]")
-
-
-def test_rows_are_named_for_every_copy_and_of_an_inner_physics():
-    physics = FunctionPhysics(lambda X: X.log(), inputs=[0])
-    X = torch.tensor([[1.0, 5.0], [0.0, 5.0], [0.0, 6.0]])
+    assert str(caught.value).endswith("  row 1: [0.0]\n  row 2: [-1.0]")
+    X = X.detach().expand(2, 3, 2).requires_grad_(grad)
     with pytest.raises(PhysicsError, match="NaN or inf") as caught:
-        physics(X.expand(2, 3, 2))
+        physics(X)
     assert caught.value.rows == (1, 2, 4, 5)
-    assert caught.value.inputs.tolist() == [[0.0]] * 4
+    assert caught.value.inputs.tolist() == [[0.0], [-1.0]] * 2
     inner = FunctionPhysics(lambda X: X.log(), name="inner")
     outer = FunctionPhysics(lambda X: inner(X.flip(0)), name="outer")
     with pytest.raises(PhysicsError, match="'inner'") as caught:
@@ -214,19 +194,10 @@ def test_names_and_a_subclass_that_has_evaluate_alone():
             return -X * X.abs()
 
     X, drag = normal(3, 2), Drag(inputs=[1])
-    assert drag.name == "Drag"
     assert torch.equal(drag(X), -X[:, 1:] * X[:, 1:].abs())
-    assert FunctionPhysics(torch.sin).name == "sin"
-    assert FunctionPhysics(torch.nn.Tanh()).name == "Tanh"
-    assert FunctionPhysics(torch.sin, name="wave").name == "wave"
-
-
-def test_as_physics():
-    X, physics = normal(3, 2), BlackBoxPhysics(np.sin)
-    assert as_physics(physics) is physics
-    assert isinstance(as_physics(torch.sin), FunctionPhysics)
-    assert torch.equal(as_physics(torch.sin)(X), X.sin())
-    assert list(as_physics(torch.nn.Linear(2, 1)).parameters())
+    sines = FunctionPhysics(torch.sin), FunctionPhysics(torch.sin, name="wave")
+    kinds = (drag, *sines, FunctionPhysics(torch.nn.Tanh()))
+    assert [physics.name for physics in kinds] == ["Drag", "sin", "wave", "Tanh"]
 
 
 ARRAY = np.linspace(0.1, 1, 6).reshape(3, 2)
@@ -245,58 +216,47 @@ def test_functions_of_numpy_and_torch_are_told_apart():
     assert rows == [1]
     assert ARRAY.min() > 0
     linear = torch.nn.Linear(2, 1).double()
-    for function in (
-        torch.sin,
-        lambda X: X.sin(),
-        lambda X: torch.cat([X[:, :1].exp(), X[:, 1:]], dim=1),
-        lambda X: torch.as_tensor(X) * 2,
-        linear,
-    ):
+    for function in (torch.sin, lambda X: X.sin(), lambda X: torch.as_tensor(X) * 2, linear):
         physics = array_physics(function, ARRAY)
         assert type(physics) is FunctionPhysics
         X = torch.tensor(ARRAY)
         torch.testing.assert_close(physics(X), function(X))
     assert physics.function is not linear  # a module is copied
     physics = BlackBoxPhysics(lambda x: x[0], batched=False)
-    assert array_physics(physics, ARRAY) is physics
+    assert array_physics(physics, ARRAY) is as_physics(physics) is physics
+
+
+def no_argument(X):
+    raise KeyError("no array") if isinstance(X, np.ndarray) else IndexError("no tensor")
+
+
+PLAIN, POINTS = FunctionPhysics(square), normal(5, 2)
+OUTSIDE = r"inputs=\(0, {}\); found torch.float64, \(5, 2\)"
+CALLABLE = "found {}.*torch function.*ODEPhysics.*BlackBoxPhysics"
+REFUSED = [
+    (TypeError, "inputs must be a whole", lambda: BlackBoxPhysics(square, inputs=[0.5])),
+    (ValueError, "inputs is empty", lambda: BlackBoxPhysics(square, inputs=[])),
+    (ValueError, "Unknown gradient", lambda: BlackBoxPhysics(square, gradient="autograd")),
+    (ValueError, "fd_step must be finite", lambda: BlackBoxPhysics(square, fd_step=0.0)),
+    (TypeError, "callable; found list", lambda: BlackBoxPhysics([])),
+    (TypeError, "abstract", Physics),
+    (TypeError, r"floating-point.*found list", lambda: PLAIN([[1.0]])),
+    (TypeError, r"floating-point.*found torch.int64", lambda: PLAIN(torch.tensor([[1]]))),
+    (ValueError, r"n x d; found torch.float64, \(3,\)", lambda: PLAIN(normal(3))),
+    (ValueError, r"n x d; found torch.float64, \(3, 0\)", lambda: PLAIN(normal(3, 0))),
+    (ValueError, OUTSIDE.format(2), lambda: FunctionPhysics(square, inputs=[0, 2])(POINTS)),
+    (ValueError, OUTSIDE.format(-3), lambda: FunctionPhysics(square, inputs=[0, -3])(POINTS)),
+    (TypeError, CALLABLE.format("a list"), lambda: as_physics([torch.sin])),
+    (TypeError, CALLABLE.format("a type, <class.*Tanh"), lambda: as_physics(torch.nn.Tanh)),
+    (TypeError, "Physics or a callable", lambda: array_physics("cka", ARRAY)),
+    (
+        PhysicsError,
+        r"(?s)'no_argument'.*KeyError: 'no array'.*IndexError: no ten",
+        lambda: array_physics(no_argument, ARRAY),
+    ),
+]
 
 
 def test_refusals():
-    def no_argument(X):
-        raise KeyError("no array") if isinstance(X, np.ndarray) else IndexError("no tensor")
-
-    plain = FunctionPhysics(square)
-    for options, error, says in (
-        ({"inputs": [0.5]}, TypeError, "inputs must be a whole number; found 0.5"),
-        ({"inputs": "a"}, TypeError, "inputs must be a whole number; found 'a'"),
-        ({"inputs": []}, ValueError, "inputs is empty"),
-        *(({"gradient": g}, ValueError, "Unknown gradient") for g in ("autograd", 1, square)),
-        *(
-            ({"fd_step": step}, ValueError, "fd_step must be finite and above 0")
-            for step in (0.0, -1.0, float("nan"))
-        ),
-        ({"function": []}, TypeError, "callable; found list"),
-    ):
-        refused(error, says, BlackBoxPhysics, **{"function": square, **options})
-    for X in ([[1.0]], torch.tensor([[1]])):
-        refused(TypeError, r"floating-point.*found (list|torch.int64)", plain, X)
-    for shape in ((3,), (3, 0)):
-        says = re.escape(f"batch_shape x n x d; found torch.float64, {shape}")
-        refused(ValueError, says, plain, normal(*shape))
-    for column in (2, -3):
-        says = rf"inputs=\(0, {column}\); found torch.float64, \(5, 2\)"
-        refused(ValueError, says, FunctionPhysics(square, inputs=[0, column]), normal(5, 2))
-    refused(TypeError, "abstract", Physics)
-    refused(TypeError, "callable; found float", FunctionPhysics, 1.0)
-    for thing, found in (
-        (3.0, "a float"),
-        ([torch.sin], "a list"),
-        (None, "a NoneType"),
-        (torch.nn.Tanh, "a type, <class.*Tanh"),
-    ):
-        says = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
-        refused(TypeError, says, as_physics, thing)
-    for thing in (3, "cka", CalibratedPhysics):
-        refused(TypeError, "Physics or a callable", array_physics, thing, ARRAY)
-    says = r"(?s)'no_argument'.*KeyError: 'no array'.*IndexError: no ten"
-    refused(PhysicsError, says, array_physics, no_argument, ARRAY)
+    for case in REFUSED:
+        refused(*case)

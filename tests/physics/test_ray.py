@@ -17,9 +17,13 @@ def test_rows_run_on_both_nodes_of_a_cluster():
     from ray.cluster_utils import Cluster
     from ray.util.joblib import register_ray
 
+    class UnpicklableError(Exception):
+        def __init__(self, code, reason):
+            super().__init__(f"{reason} ({code})")
+
     def simulator(x):
         if x[0] > 90:
-            raise ValueError("no solution here")
+            raise UnpicklableError(7, "no solution here")
         time.sleep(0.3)  # or one node does all while the other starts
         ray_node = ray.get_runtime_context().get_node_id()
         return [x[0] ** 2, float(int(ray_node[:8], 16))]
@@ -32,13 +36,15 @@ def test_rows_run_on_both_nodes_of_a_cluster():
         ray.init(address=cluster.address, log_to_driver=False)
         cluster.wait_for_nodes()
         register_ray()
-        X = torch.arange(40.0).double().unsqueeze(-1)
+        X = torch.arange(16.0).double().unsqueeze(-1)
         one_each = {"num_cpus": 1}  # or a node may get both workers
         with joblib.parallel_config(backend="ray", n_jobs=2, ray_remote_args=one_each):
             values = physics(X)
-            with pytest.raises(PhysicsError, match="no solution here") as caught:
-                physics(X + 60)
-        assert len(caught.value.rows) == 9
+            with pytest.raises(
+                PhysicsError, match=r"UnpicklableError: no solution here \(7\)"
+            ) as caught:
+                physics(X + 80)
+        assert len(caught.value.rows) == 5
     finally:
         ray.shutdown()
         cluster.shutdown()
