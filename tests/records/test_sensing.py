@@ -80,16 +80,16 @@ def test_sensors_without_unknowns_change_nothing():
 
 @pytest.mark.slow
 def test_intervals_cover_the_parameters_of_sensor_and_spring():
-    shares = []
-    for seed in range(6):
+    covered = []
+    for seed in range(20):
         records, true = late_log(seed)
         found = identify(records, spring(), start=START, sensors=SENSORS, num_starts=4)
         low, high = found.parameters.interval()
-        shares.append(((low <= torch.tensor(true)) & (torch.tensor(true) <= high)).double().mean())
+        covered.append(((low <= torch.tensor(true)) & (torch.tensor(true) <= high)).tolist())
         gain = float(found.parameters["x_gain"].mean())
         assert float(found.smoothed.noise[0]) * gain == pytest.approx(0.01, rel=0.2)
         assert found.errors["identified"][0] < 0.015 / gain
-    assert np.mean(shares) >= 0.9
+    assert (np.mean(covered, 0) >= 0.9).all(), np.mean(covered, 0)
 
 
 def test_a_log_may_tell_a_delay_or_not():
