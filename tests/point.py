@@ -60,14 +60,13 @@ def point_dynamics():
 @pytest.fixture
 def crude_dynamics():
     """Makes dynamics that learn the point from a physics, by a point fit."""
-    fit = {"method": "map"}
-    return lambda physics: LearnedDynamics(POINT_SPEC, physics, fit_options=fit)
+    return partial(LearnedDynamics, POINT_SPEC, fit_options={"method": "map"})
 
 
 @pytest.fixture
 def learnt_dynamics(crude_dynamics):
     """Makes dynamics that learn the point from a physics that errs."""
-    return lambda: crude_dynamics(lambda X: X[:, :1] + 0.4 * X[:, 1:])
+    return partial(crude_dynamics, lambda X: X[:, :1] + 0.4 * X[:, 1:])
 
 
 @pytest.fixture
