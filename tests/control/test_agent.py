@@ -5,7 +5,6 @@ import sys
 from contextlib import nullcontext
 from dataclasses import replace
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -296,14 +295,6 @@ def test_what_is_recorded_is_read_once_an_episode(make_agent, monkeypatch):
     )
     make_agent(MPCAgent).learn(10)
     assert len(read) <= 5  # before the first, and two of each
-
-
-@pytest.mark.slow
-def test_the_cart_pole_swings_up_in_two_trials():
-    env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-    task = Task(LearnedDynamics(CART_POLE_SPEC, cart_pole(3).physics), cart_pole_reward)
-    agent = MPCAgent(env, task, seed=3).learn(50)
-    assert agent.recorded_episodes(newest=25).rewards.mean() > -0.45
 
 
 def test_long_learning_shows_bars_where_somebody_sees_them(make_agent, kind, monkeypatch, capsys):
