@@ -2,7 +2,6 @@
 
 from dataclasses import fields
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -40,12 +39,6 @@ def point_agent(point_env, point_task):
         return algorithm(env=env, task=task, options=options, **{**defaults, **given})
 
     return make
-
-
-@pytest.fixture
-def cart_pole():
-    """Makes the cart-pole's environment."""
-    return lambda **options: gymnasium.make("gpadjust/CartPoleSwingUp-v0", **options)
 
 
 @pytest.fixture
