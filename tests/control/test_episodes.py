@@ -3,11 +3,13 @@
 import math
 from types import SimpleNamespace
 
+import gymnasium
 import pytest
 import torch
 from gymnasium import spaces
 
-from gpadjust.control.episodes import completed, far_bounds
+import gpadjust.systems  # noqa: F401 - registers the environment
+from gpadjust.control.episodes import completed, episode_length, far_bounds
 from gpadjust.control.learning import check_functions, learn_dynamics, learnable, warn_of_bounds
 from gpadjust.core import Prediction
 from gpadjust.dynamics import Dynamics, PhysicsDynamics, StateSpec, Trajectories
@@ -63,6 +65,7 @@ def test_a_task_is_completed_where_it_says_nothing():
     assert starts.shape == (200, 2)
     assert {*starts[:, 0].tolist()} == {0, 3, 6}
     assert completed(task(3), recorded(0), ENV).initial_states is None
+    assert episode_length(task(None), gymnasium.make("gpadjust/CartPoleSwingUp-v0")) == 25
 
 
 def test_bounds_leave_room_for_what_the_physics_reaches(moved):

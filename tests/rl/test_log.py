@@ -93,10 +93,10 @@ def test_hooks_of_the_model(point_agent, learnt_dynamics, monkeypatch):
 
 @pytest.mark.slow
 def test_scores_of_trajectories_are_logged_and_change_nothing(
-    point_agent, sampled_dynamics, assert_same
+    point_agent, learnt_dynamics, assert_same
 ):
     one, other = (
-        point_agent(dynamics=sampled_dynamics(), score_horizons=horizons).learn(15, log_interval=9)
+        point_agent(dynamics=learnt_dynamics(), score_horizons=horizons).learn(15, log_interval=9)
         for horizons in ((1, 5), ())
     )
     found, without = (agent.logger.name_to_value for agent in (one, other))
@@ -104,6 +104,9 @@ def test_scores_of_trajectories_are_logged_and_change_nothing(
         f"model/{name}_{k}" for name in ("nlpd", "coverage", "energy") for k in (1, 5)
     }
     assert_same(one, other)
+    assert "DynaSAC(Point, LearnedDynamics, 3 episodes learnt, 15 steps, last " in repr(one)
+    one.task = None
+    assert repr(one) == "DynaSAC(Point, no task)"
 
 
 def test_callbacks_of_agents_are_called(point_agent, capsys):
@@ -116,10 +119,3 @@ def test_callbacks_of_agents_are_called(point_agent, capsys):
     with pytest.warns(match="rich is experimental"):
         point_agent().learn(10, [print_progress], progress_bar=True)
     assert "10/10" in capsys.readouterr().out
-
-
-def test_its_representation_says_what_it_is(point_agent):
-    last = point_agent().learn(10)
-    assert "DynaSAC(Point, PhysicsDynamics, 2 episodes learnt, 10 steps, last " in repr(last)
-    last.task = None
-    assert repr(last) == "DynaSAC(Point, no task)"

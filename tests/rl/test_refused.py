@@ -14,7 +14,6 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import Dyna, DynaCallback, DynaSAC
 from tests.point import POINT_SPEC
-from tests.rl.conftest import model_rows
 
 LINE, PLANE = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (2,))
 
@@ -59,9 +58,7 @@ CALLS = [
     (lambda at: at.agent().model_env(3), "initial_states"),
     (lambda at: at.agent().predict(np.array([np.nan], dtype=np.float32)), "No action can be chos"),
     (lambda at: at.particles(observation_space=PLANE), "observation has 1 entries"),
-    (lambda at: at.particles(observation_space=spaces.Discrete(2)), "observation has 1 entries"),
     (lambda at: at.particles(num_envs=0), "num_envs must be at least 1; found 0"),
-    (lambda at: at.particles(sampling="swarm"), "Unknown sampling 'swarm'"),
     (lambda at: at.particles(initial_states=None), "needs a task with initial_states"),
     (
         lambda at: stepped(at.particles(initial_states=torch.zeros)),
@@ -124,7 +121,3 @@ def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
         point_agent(reward=noisy).learn(5)
     for tolerance in (0.1, None):
         assert point_agent(reward=noisy, reward_tolerance=tolerance).learn(5).num_episodes == 1
-
-
-def test_a_time_limit_put_around_by_hand_is_read(point_agent):
-    assert model_rows(point_agent(episode_length=None).learn(5)) == 2 * 5
