@@ -5,7 +5,8 @@ from __future__ import annotations
 import inspect
 import time
 import warnings
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any, ClassVar, Self
 
@@ -29,7 +30,7 @@ from stable_baselines3.common.vec_env import (
 from gpadjust.checks import check_kind
 from gpadjust.control import EpisodeCheckpoint, StepGuard, Task
 from gpadjust.control import episodes as real
-from gpadjust.control.checkpoint import pickled_environment
+from gpadjust.control.checkpoint import locks_of, pickled_environment
 from gpadjust.control.learning import check_functions, learn_dynamics
 from gpadjust.control.summary import agent_table, agent_text
 from gpadjust.display import Display
@@ -40,7 +41,7 @@ from gpadjust.rl.options import DynaOptions
 
 
 class DynaCallback(BaseCallback):
-    """A Stable-Baselines3 callback with two more hooks, for :class:`Dyna` agents.
+    """A Stable-Baselines3 callback with a hook after each fit, for :class:`Dyna` agents.
 
     A subclass with ``_init_callback`` must call that of this class.
     """
@@ -60,9 +61,6 @@ class DynaCallback(BaseCallback):
 
     def on_model_fit(self, metrics: dict[str, float]) -> None:
         """React to a fit, with the numbers of the event ``"fit"`` of an ``Agent``."""
-
-    def on_model_episodes(self, returns: np.ndarray) -> None:
-        """React to parallel model episodes, with their returns."""
 
 
 class AgentCallback(DynaCallback):
@@ -252,14 +250,14 @@ class Dyna(OffPolicyAlgorithm, Display):
             check_functions(self.task, data, options.reward_tolerance)
         # Update on real transitions, and on transitions of earlier models.
         buffer.mix = uses_model
-        with real.timed(self.wall_time, "update"):
+        with _timed(self.wall_time, "update"):
             super().train(gradient_steps, batch_size)
         if not is_enough:
             return
         # Update the dynamics by the new episodes.
         metrics: dict[str, float] = {}
         if uses_model:
-            with real.timed(self.wall_time, "fit"):
+            with _timed(self.wall_time, "fit"):
                 horizons = options.score_horizons
                 metrics = learn_dynamics(self.model_task(), data, recorded, horizons)
         buffer.num_learnt = len(recorded)
@@ -290,14 +288,14 @@ class Dyna(OffPolicyAlgorithm, Display):
         for start in range(0, num_episodes, at_once):
             env = self.model_env(min(num_episodes - start, at_once))
             noise = self._model_noise(env.num_envs)
-            with real.timed(self.wall_time, "rollout"):
+            with _timed(self.wall_time, "rollout"):
                 if start == 0 and self.options.refresh_model_data:
                     env.refresh(self.replay_buffer.model_buffer)
                 obs = env.reset()
             returns = np.zeros(env.num_envs)
             running = np.ones(env.num_envs, dtype=bool)
             while running.any():
-                with real.timed(self.wall_time, "rollout"):
+                with _timed(self.wall_time, "rollout"):
                     # One step of the particles whose episode has not ended, into the buffer.
                     ahead = env.steps_ahead
                     actions = self._act_in_model(obs, noise)
@@ -324,11 +322,9 @@ class Dyna(OffPolicyAlgorithm, Display):
                 updates = int(self.owed_updates + 1e-9) // interval * interval
                 self.owed_updates -= updates
                 if updates:
-                    with real.timed(self.wall_time, "update"):
+                    with _timed(self.wall_time, "update"):
                         super().train(updates, batch_size)
             all_returns.append(returns)
-            for hook in self.model_hooks:
-                hook.on_model_episodes(returns)
         self.logger.record("model/ep_rew_mean", float(np.concatenate(all_returns).mean()))
         self.logger.record("model/left_bounds", num_left)
         if num_steps == num_left == self.replay_buffer.model_buffer.size():
@@ -406,10 +402,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         adapted: Any = [AgentCallback.around(part) for part in callbacks]
         if len(adapted) == 1:
             adapted = adapted[0]
-        with ExitStack() as stack:
-            for part in callbacks:
-                if isinstance(part, EpisodeCheckpoint):
-                    stack.enter_context(part.locked())
+        with locks_of(callbacks):
             return super().learn(total_timesteps, adapted, *args, **kwargs)
 
     def _setup_learn(
@@ -493,6 +486,16 @@ class Dyna(OffPolicyAlgorithm, Display):
         else:
             state, envs = cloudpickle.loads(environment[1])
             vars(inner).update(state, envs=envs)
+
+
+@contextmanager
+def _timed(wall_time: dict[str, float], part: str) -> Iterator[None]:
+    """Add the seconds of a block to a part."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        wall_time[part] += time.perf_counter() - start
 
 
 _OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space", "metadata")
