@@ -40,34 +40,13 @@ from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 
 
-class DynaCallback(BaseCallback):
-    """A Stable-Baselines3 callback with a hook after each fit, for :class:`Dyna` agents.
-
-    A subclass with ``_init_callback`` must call that of this class.
-    """
-
-    model: Any
-
-    def _init_callback(self) -> None:
-        if not hasattr(self.model, "model_hooks"):
-            raise TypeError(
-                f"{type(self).__name__} is for Dyna agents, such as DynaSAC; found "
-                f"{type(self.model).__name__}."
-            )
-        self.model.model_hooks.append(self)
-
-    def _on_step(self) -> bool:
-        return True
-
-    def on_model_fit(self, metrics: dict[str, float]) -> None:
-        """React to a fit, with the numbers of the event ``"fit"`` of an ``Agent``."""
-
-
-class AgentCallback(DynaCallback):
+class AgentCallback(BaseCallback):
     """Calls a callback of :class:`gpadjust.control.Agent` at the corresponding events of Dyna.
 
     A trial is a rollout of Stable-Baselines3 in which an episode ends.
     """
+
+    model: Any
 
     def __init__(self, callback: Any) -> None:
         super().__init__()
@@ -86,9 +65,11 @@ class AgentCallback(DynaCallback):
             return callback
         return AgentCallback(callback)
 
-    def on_model_fit(self, metrics: dict[str, float]) -> None:
-        """Report a fit of the dynamics."""
-        self.callback(self.model, "fit", metrics)
+    def _init_callback(self) -> None:
+        self.model.fit_callbacks.append(self.callback)
+
+    def _on_step(self) -> bool:
+        return True
 
     def _on_rollout_start(self) -> None:
         # The updates of the last episode are done, and the next has not begun.
@@ -151,7 +132,7 @@ class Dyna(OffPolicyAlgorithm, Display):
     """
 
     not_saved: ClassVar[tuple[str, ...]] = (
-        *("env", "task", "model_hooks", "_random_state"),
+        *("env", "task", "fit_callbacks", "_random_state"),
         *("_vec_normalize_env", "_logger", "_custom_logger"),
     )
     replay_buffer: MixedReplayBuffer
@@ -199,7 +180,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         self.owed_updates = 0.0  # fraction of an update, of earlier steps in the model
         self.wall_time = dict.fromkeys(("fit", "rollout", "update"), 0.0)
         self.notes: dict[str, Any] = {}
-        self.model_hooks: list[DynaCallback] = []
+        self.fit_callbacks: list[Any] = []  # of agents
         if kwargs.get("_init_setup_model", True):  # `load` sets the task afterwards
             self._check_task()
         super().__init__(
@@ -267,8 +248,8 @@ class Dyna(OffPolicyAlgorithm, Display):
             self.logger.record(f"model/{name}", value)
         if not uses_model:
             return
-        for hook in self.model_hooks:
-            hook.on_model_fit(metrics)
+        for callback in self.fit_callbacks:
+            callback(self, "fit", metrics)
         # Train in the newest model.
         self._train_in_model(options.model_episodes * num_ended, batch_size)
         total = sum(self.wall_time.values())
@@ -416,7 +397,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         self._check_task()
         if reset_num_timesteps or self._last_obs is None:  # SB3 ends the episodes under way
             self.replay_buffer.end_episodes()
-        self.model_hooks = []  # callbacks with hooks add themselves
+        self.fit_callbacks = []  # callbacks of agents add themselves
         noise = deepcopy(self.action_noise)  # SB3 resets it
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
         observations: Any = self._last_obs
@@ -458,7 +439,7 @@ class Dyna(OffPolicyAlgorithm, Display):
     # Checkpoints
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "task", "model_hooks", "_random_state"]
+        return [*super()._excluded_save_params(), "task", "fit_callbacks", "_random_state"]
 
     @classmethod
     def wrapped(cls, env: GymEnv) -> VecEnv:
@@ -476,7 +457,7 @@ class Dyna(OffPolicyAlgorithm, Display):
     def go_on(self, env: VecEnv, task: Task, environment: Any) -> None:
         """Set environment and task, after the attributes of a checkpoint."""
         self.env, self.task = env, task
-        self.model_hooks = []
+        self.fit_callbacks = []
         self._vec_normalize_env = unwrap_vec_normalize(env)
         *wrappers, inner = _layers(env)
         for layer, state in zip(wrappers, environment[0], strict=True):

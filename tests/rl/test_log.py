@@ -9,7 +9,6 @@ import torch
 from stable_baselines3.common.callbacks import (
     CheckpointCallback,
     EvalCallback,
-    EveryNTimesteps,
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.env_util import make_vec_env
@@ -18,7 +17,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from gpadjust.control import print_progress
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.rl import DynaCallback
 from tests.rl.conftest import model_rows
 
 
@@ -60,32 +58,27 @@ def test_callbacks_of_stable_baselines(point_agent, normalised, point_env, tmp_p
         assert (tmp_path / f"agent_{name}").exists()
 
 
-class Watch(DynaCallback):
-    def __init__(self):
-        super().__init__()
-        self.fits = []
+def test_fits_are_told_and_an_error_there_learns_nothing_twice(point_agent, learnt_dynamics):
+    fits = []
 
-    def on_model_fit(self, metrics):
-        self.fits.append(metrics)
+    def note(agent, event, values):
+        if event == "fit":
+            fits.append(values)
+            if len(fits) == 3:
+                raise OSError("full")
 
-
-def test_hooks_of_the_model(point_agent, learnt_dynamics, monkeypatch):
-    watch = Watch()
     options = {"model_episodes": 3, "num_particles": 2, "refresh_model_data": False}
-    agent = point_agent(dynamics=learnt_dynamics(), **options)
-    agent.learn(10, EveryNTimesteps(5, watch))
-    assert [*watch.fits[0]] == ["fit_seconds"]
-    assert watch.fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
-    assert all(np.isfinite([*metrics.values()]).all() for metrics in watch.fits)
+    agent = point_agent(dynamics=learnt_dynamics(), **options).learn(10, note)
+    assert [*fits[0]] == ["fit_seconds"]
+    assert fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
+    assert all(np.isfinite([*metrics.values()]).all() for metrics in fits)
     rewards = agent.replay_buffer.model_buffer.rewards[15:30, 0]  # of the last three episodes
     expected = pytest.approx(rewards.sum() / 3, rel=1e-5)
     assert agent.logger.name_to_value["model/ep_rew_mean"] == expected
-    monkeypatch.setattr(watch, "on_model_fit", {}.popitem)  # which raises an error
-    with pytest.raises(TypeError, match="popitem"):
-        agent.learn(5, watch, reset_num_timesteps=False)
+    with pytest.raises(OSError, match="full"):
+        agent.learn(5, note, reset_num_timesteps=False)
     agent.learn(5, reset_num_timesteps=False)
-    assert len(watch.fits) == 2
-    assert agent.task.dynamics.num_transitions == 20  # nothing twice
+    assert agent.task.dynamics.num_transitions == 20
 
 
 @pytest.mark.slow

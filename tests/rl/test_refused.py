@@ -12,7 +12,7 @@ from stable_baselines3 import PPO, SAC, TD3
 from gpadjust.control import EpisodeCheckpoint
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import PhysicsError
-from gpadjust.rl import Dyna, DynaCallback, DynaSAC
+from gpadjust.rl import Dyna, DynaSAC
 from tests.point import POINT_SPEC
 
 LINE, PLANE = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (2,))
@@ -54,7 +54,6 @@ CALLS = [
     (lambda at: at.agent(at.env().unwrapped, episode_length=None).learn(5), "no time limit"),
     (lambda at: at.agent(use_sde=True).learn(5, at.checkpoint), "cannot resume use_sde=True"),
     (lambda at: at.sac().learn(5, at.checkpoint), "is for learners with a model"),
-    (lambda at: at.sac().learn(5, DynaCallback()), "DynaCallback is for Dyna agents.*found SAC"),
     (lambda at: at.agent().model_env(3), "initial_states"),
     (lambda at: at.agent().predict(np.array([np.nan], dtype=np.float32)), "No action can be chos"),
     (lambda at: at.particles(observation_space=PLANE), "observation has 1 entries"),

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.rl import DynaCallback, DynaSAC
+from gpadjust.rl import DynaSAC
 from tests.point import POINT_SPEC, robot
 
 
@@ -55,11 +55,11 @@ def test_the_file_holds_neither_physics_nor_functions_nor_environment(
         reward=Unpicklable(lambda states, actions, next_states: -next_states[:, 0].square()),
         initial_states=Unpicklable(lambda n: torch.ones(n, 1)),
     )
-    agent.learn(5, DynaCallback())
+    agent.learn(5, Unpicklable(lambda agent, event, values: None))
     agent.save(tmp_path / "agent.zip")
     with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
         data = archive.read("data").decode()
-    for name in ("task", "dynamics", "env", "model_hooks"):
+    for name in ("task", "dynamics", "env", "fit_callbacks"):
         assert f'"{name}":' not in data
 
 
