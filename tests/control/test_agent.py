@@ -12,11 +12,10 @@ from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from gpadjust import ZeroMeanGP, progress
-from gpadjust.control import Agent, MPCAgent, PolicySearchAgent, Task, print_progress
+from gpadjust.control import Agent, MPCAgent, PolicySearchAgent, print_progress
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import FunctionPhysics, PhysicsError, Unknown
-from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
-from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
+from gpadjust.systems import cart_pole
 from tests.control.conftest import KINDS, PLAN, Log
 from tests.point import POINT_SPEC, Faulty
 
@@ -70,10 +69,8 @@ class Farthest(Agent):
 
 def test_an_agent_of_ones_own_needs_predict_alone(make_agent):
     agent = make_agent(Farthest)
-    assert agent.model is None
     assert agent.predict(np.ones(1))[0] == -2  # by the physics
-    agent.learn(10)
-    assert (agent.recorded_episodes().actions == -2).all()
+    assert (agent.learn(10).recorded_episodes().actions == -2).all()
     assert agent.num_episodes == 2
 
 
@@ -156,9 +153,9 @@ def test_a_searched_policy_promises_what_its_last_search_found(make_agent):
 def test_the_real_reward_is_of_new_episodes_though_fresh_dynamics_learn_all(
     make_agent, learnt_dynamics
 ):
-    log, agent = Log("fit"), make_agent(MPCAgent).learn(10)
+    log, agent = Log("fit"), make_agent(MPCAgent).learn(5)
     agent.task = replace(agent.task, dynamics=learnt_dynamics())
-    assert agent.learn(5, log).task.dynamics.num_transitions == 15
+    assert agent.learn(5, log).task.dynamics.num_transitions == 10
     newest = agent.recorded_episodes(newest=5).rewards.mean()
     assert log[-1]["real_reward"] == pytest.approx(float(newest))
 
@@ -276,12 +273,10 @@ def test_a_physics_that_fails_for_a_while_loses_no_transition(make_agent, crude_
 
 
 def test_observations_in_another_order_cost_no_episode():
-    order = [0, 3, 1, 2, 4]
-    env = CartPoleSwingUpEnv()
+    system, order = cart_pole(), [0, 3, 1, 2, 4]
+    env = system.make()
     shuffled = TransformObservation(env, lambda seen: seen[order], env.observation_space)
-    dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole().physics)
-    task = Task(dynamics, cart_pole_reward, episode_length=25)
-    agent = MPCAgent(shuffled, task, PLAN, first=PLAN, seed=0)
+    agent = MPCAgent(shuffled, system.task(), PLAN, first=PLAN, seed=0)
     with pytest.raises(ValueError, match="sine and cosine of the angle 'theta'"):
         agent.learn(25)
     assert agent.num_timesteps == 0

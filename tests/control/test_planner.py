@@ -11,6 +11,7 @@ from gpadjust.control.rollouts import random_sequences
 from gpadjust.physics import PhysicsError
 from tests.control.conftest import BOUNDS, EVEN, ZERO, fails_beyond, point_of, to_one
 from tests.point import POINT_SPEC
+from tests.systems import normal
 
 pytestmark = pytest.mark.filterwarnings("ignore:L-BFGS did not converge")
 
@@ -132,7 +133,7 @@ def test_staying_is_better_than_leaving_however_few_the_sequences(seed):
 # Returns
 
 
-def test_a_return_is_the_sum_of_the_rewards_that_are_made():
+def test_a_return_is_the_sum_of_the_rewards_that_are_made_or_a_quantile():
     beyond = (1.5 - 1.2) / 5.1  # in halves of the width
     worst = -0.5 - 1.5 * (2e6 + 40 * beyond)
     for parts, expected in [
@@ -143,6 +144,10 @@ def test_a_return_is_the_sum_of_the_rewards_that_are_made():
         task = point_of(**parts)
         score = Return().make_score(task)(Rollouts(task, 2).follow(ZERO, SEQUENCES))
         torch.testing.assert_close(score, torch.tensor(expected, dtype=torch.float64))
+    rollout = Rollouts(point_of(), 11).follow(ZERO, SEQUENCES)
+    rewards = normal(11, 2, 3)
+    careful = Return(quantile=0.2).make_score(point_of())(rollout._replace(rewards=rewards))
+    torch.testing.assert_close(careful, rewards.sum(-1).sort(0).values[2])  # the third of 11
 
 
 @pytest.mark.parametrize(
