@@ -11,10 +11,10 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.physics import PhysicsError
 from gpadjust.rl import MixedReplayBuffer, ModelVecEnv
 from gpadjust.systems import cart_pole
 from gpadjust.systems.swing_up import REAL_CART_POLE, cart_pole_start, equation_physics
+from tests.control.conftest import fails_beyond
 from tests.point import POINT_SPEC
 from tests.systems import uniform
 
@@ -188,29 +188,23 @@ def test_particles_that_leave_the_numbers_end(point_particles, point_dynamics):
         assert np.isfinite(values).all()
 
 
-@pytest.fixture
-def choosy_dynamics():
-    """The point, whose physics fails at large actions."""
-
-    def choosy(X):
-        bad = (X[:, 1] > 1.5).nonzero().flatten().tolist()
-        if bad:
-            raise PhysicsError("too fast", bad)
-        return X[:, :1] + 0.4 * X[:, 1:]
-
-    return PhysicsDynamics(POINT_SPEC, choosy)
+CHOOSY = PhysicsDynamics(POINT_SPEC, fails_beyond(1.2))
 
 
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
-def test_particles_at_which_the_physics_fails_end(point_particles, choosy_dynamics, sampling):
-    env = point_particles(dynamics=choosy_dynamics, sampling=sampling)
-    obs, _, dones, infos = moved(env, 1, 2, 0)
+def test_particles_at_which_the_physics_fails_end(point_particles, sampling):
+    """Rows are filled up to blocks of one size, which the physics may blame."""
+    env = point_particles(dynamics=CHOOSY, sampling=sampling)
+    moved(env, 0, 1, -1)
+    obs, _, dones, infos = env.step(np.zeros((3, 1)))
     assert dones.tolist() == [False, True, False]
     assert infos[1]["left_bounds"]
-    assert obs[:, 0].tolist() == pytest.approx([1.4, 1.0, 1.0])
-    _, _, dones, infos = moved(env, 2, 2, 2)
-    assert dones.all()
-    assert all(info["left_bounds"] for info in infos)
+    assert infos[1]["terminal_observation"] == 1.5
+    assert obs[:, 0].tolist() == [1.0, 1.0, 0.5]
+    for failing in (0, 3, 6):
+        states = np.where(np.arange(7) == failing, 1.5, 1.0)[:, None]
+        left = refreshed(env, states, np.zeros((7, 1))).dones[:7, 0].astype(bool)
+        assert left.nonzero()[0].tolist() == [failing]
 
 
 # Transitions of earlier models
@@ -223,16 +217,6 @@ def refreshed(env, states, actions):
     mixed.add_model_rows(states, states + 99, actions, zeros, zeros, zeros)
     env.refresh(mixed.model_buffer)
     return mixed.model_buffer
-
-
-@pytest.mark.parametrize("failing", [0, 3, 6])
-def test_functions_whose_physics_fails_at_any_row(point_particles, choosy_dynamics, failing):
-    """Rows are filled up to blocks of one size, which the physics may blame."""
-    env = point_particles(dynamics=choosy_dynamics, sampling="trajectory")
-    env.reset()
-    scaled = np.where(np.arange(7) == failing, 1.0, 0.1)[:, None]
-    left = refreshed(env, np.ones((7, 1)), scaled).dones[:7, 0].astype(bool)
-    assert left.nonzero()[0].tolist() == [failing]
 
 
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
