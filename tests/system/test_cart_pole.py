@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import sympy
 import torch
-from scipy.integrate import solve_ivp
 
-from gpadjust.physics import ODEPhysics
 from gpadjust.systems import CartPoleEquation, cart_pole
 from gpadjust.systems.swing_up import (
     REAL_CART_POLE,
@@ -57,24 +55,6 @@ def test_equation_is_that_of_the_lagrangian(mechanics, states_and_forces, parame
     expected = mechanics(states.T, forces[:, 0], (*parameters, 9.82))
     torch.testing.assert_close(rates[:, :2], states[:, 2:], rtol=0, atol=0)
     torch.testing.assert_close(rates[:, 2:], torch.stack(expected, -1))
-
-
-def test_step_agrees_with_scipy(states_and_forces):
-    states, forces = states_and_forces(10)
-
-    def final(state, force):
-        def rate(t, y):
-            return REAL_CART_POLE(torch.tensor(y), force).numpy()
-
-        path = solve_ivp(rate, (0, 0.1), state.numpy(), method="DOP853", rtol=1e-11, atol=1e-11)
-        return torch.tensor(path.y[:, -1])
-
-    expected = torch.stack([final(*row) for row in zip(states, forces, strict=True)])
-    physics = equation_physics(REAL_CART_POLE)
-    X = torch.cat([states, forces], dim=-1)
-    torch.testing.assert_close(physics(X), expected, rtol=0, atol=1e-3)
-    fine = ODEPhysics(REAL_CART_POLE, step=0.1, state_dim=4, substeps=100)
-    torch.testing.assert_close(fine(X), expected, rtol=0, atol=1e-8)
 
 
 def test_equation_takes_any_batch_and_is_differentiable(states_and_forces):
