@@ -184,6 +184,3 @@ def test_records_are_smoothed_by_the_force_of_one_step_before():
     assert len(found) == 59
     error, raw = ((each[:, 0] - x[1:, 0]).square().mean().sqrt() for each in (found, noisy[1:]))
     assert error < 0.7 * raw
-    lagged = StateSpec(["x", "x_1"], ["u"], previous={"x_1": "x"}, physics_reads=["x_1", "u"])
-    words = "'x_1', an earlier value of the state 'x'"
-    refused(ValueError, words, smooth, Records(records.records, lagged), physics)

@@ -46,17 +46,6 @@ def test_a_state_that_is_measured_once_is_refused(cart_pole_system, make):
     refused(ValueError, "from, got 1 with a measured 'omega'", update, states, actions, following)
 
 
-def test_scores_are_over_what_was_measured(cart_pole_system, learnt_cart_pole, holed):
-    system, dynamics = cart_pole_system, learnt_cart_pole
-    scores = dynamics.score(*holed)
-    for column in range(4):
-        known = ~holed[2][:, column].isnan()
-        whole = dynamics.score(*(t[known] for t in system.trial(0)))
-        for name in ("rmse", "median", "nlpd", "crps", "coverage"):
-            pair = (getattr(each, name)[column] for each in (scores, whole))
-            torch.testing.assert_close(*pair)
-
-
 def test_a_row_of_nothing_is_refused(cart_pole_system, learnt_cart_pole, make, holed):
     system, dynamics = cart_pole_system, learnt_cart_pole
     holed[2][11] = math.nan

@@ -57,7 +57,6 @@ def test_states_that_are_not_as_declared_are_named():
     for make, declared, words in (
         (PhysicsDynamics, {"previous": {"x": "a"}}, "'x' is declared as the previous action 'a'"),
         (LearnedDynamics, {"exogenous": ["x"]}, "'x' is declared as exogenous"),
-        (PhysicsDynamics, {"integrated": {"x": "v"}, "step": 0.3}, "'x' is declared as integrated"),
     ):
         dynamics = make(StateSpec(["x", "v"], ["a"], **declared), push)
         refused(ValueError, words, dynamics.update, *transitions())

@@ -54,19 +54,6 @@ def test_model_rows_are_transitions_of_the_model(point_agent):
     np.testing.assert_array_equal(dones, timeouts)
 
 
-def test_states_beyond_the_bounds_are_not_followed(point_agent):
-    bounds = torch.tensor([[0.9], [1.1]])
-    agent = point_agent(state_bounds=bounds, initial_states=lambda n: torch.ones(n, 1)).learn(10)
-    rows, n = agent.replay_buffer.model_buffer, model_rows(agent)
-    assert 0 < n < 2 * 2 * 5
-    following = rows.next_observations[:n]
-    assert ((following > 0.9) & (following < 1.1)).all()
-    stayed = (following == rows.observations[:n]).all(-1)[:, 0]
-    assert stayed.any()
-    assert rows.timeouts[:n, 0][stayed].all()
-    assert rows.rewards[:n, 0][stayed].max() <= rows.rewards[:n, 0][~stayed].min(initial=0)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [DynaSAC, DynaTD3])
 def test_a_trivial_task_is_improved(point_agent, algorithm):

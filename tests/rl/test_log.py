@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from gpadjust.control import print_progress
 from gpadjust.dynamics import PhysicsDynamics
+from tests.point import POINT_SPEC
 from tests.rl.conftest import model_rows
 
 
@@ -34,16 +35,21 @@ def test_metrics_of_the_model_are_logged(point_agent, learnt_dynamics, tmp_path)
     assert float(last["model/left_bounds"]) == 0
 
 
-def test_particles_that_left_the_bounds_are_logged_once(point_agent, point_dynamics):
-    runaway = PhysicsDynamics(
-        point_dynamics.spec, lambda X: X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
-    )
+def test_particles_that_left_the_bounds_are_logged_once(point_agent):
+    def runaway(X):
+        return X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
+
     starts = torch.tensor([[0.6], [1.4], [0.8]])
     options = {"model_episodes": 3, "updates_per_model_step": 1}
-    agent = point_agent(dynamics=runaway, initial_states=lambda n: starts[:n], **options).learn(5)
+    options |= {"initial_states": lambda n: starts[:n]}
+    agent = point_agent(dynamics=PhysicsDynamics(POINT_SPEC, runaway), **options).learn(5)
     assert agent.logger.name_to_value["model/left_bounds"] == 1
     assert model_rows(agent) == 1 + 2 * 5
     assert agent._n_updates == 5 + 1 + 2 * 5
+    rows = agent.replay_buffer.model_buffer
+    left = rows.next_observations[:, 0, 0] == np.float32(1.4)
+    assert rows.timeouts[left, 0].all()
+    assert rows.rewards[left, 0] <= rows.rewards[:11, 0].min()
 
 
 def test_callbacks_of_stable_baselines(point_agent, normalised, point_env, tmp_path):

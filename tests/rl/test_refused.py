@@ -104,14 +104,6 @@ def test_wrong_functions_are_found_before_the_first_real_step(point_agent, parts
     assert agent.num_timesteps == 0
 
 
-def test_terminations_that_come_late_are_refused(point_agent, point_env):
-    env = point_env()
-    agent = point_agent(env).learn(5)
-    env.unwrapped.end = -9
-    with pytest.raises(ValueError, match="terminated=True, but the task has False"):
-        agent.learn(5, reset_num_timesteps=False)
-
-
 def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
     def noisy(*transition):
         return 1.05 * point_reward(*transition)
