@@ -62,6 +62,24 @@ def test_the_cross_entropy_method_finds_an_optimum():
     assert torch.equal(kept.actions, best)
 
 
+def test_the_best_sequences_of_earlier_rounds_stay():
+    """Here all later ones are worse, and of these the largest actions best."""
+    calls = []
+
+    class First(Objective):
+        def make_score(self, task):
+            def score(rollout):
+                calls.append(rollout.actions[0])
+                size = rollout.actions[0].sum((-2, -1))
+                return -size.abs() if len(calls) == 1 else size - 100
+
+            return score
+
+    Planner(First(), rounds=3, num_elites=8, num_random=60).plan(point_of(), ZERO, BOUNDS, 4)
+    means = [actions.mean().item() for actions in calls[1:]]
+    assert means == pytest.approx([means[0]] * 3, abs=0.3)
+
+
 # Trials in functions
 
 
