@@ -7,7 +7,6 @@ import time
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control import episodes
-from gpadjust.control.checkpoint import EpisodeCheckpoint, pickled_environment
+from gpadjust.control.checkpoint import EpisodeCheckpoint, locks_of, pickled_environment
 from gpadjust.control.learning import (
     check_functions,
     learn_dynamics,
@@ -84,7 +83,6 @@ class Agent(ABC, Display):
         num_timesteps: Number of real steps.
         num_episodes: Number of real episodes in the dynamics.
         promised_reward: Promised reward of a step in the newest episodes; None for random actions.
-        wall_time: Seconds spent on ``"plan"`` (the actions), ``"fit"`` and ``"update"``.
         notes: Your data, saved and resumed with the agent.
 
     Raises:
@@ -125,7 +123,6 @@ class Agent(ABC, Display):
         self.num_timesteps = 0
         self.num_episodes = 0
         self.promised_reward: float | None = None
-        self.wall_time = dict.fromkeys(("plan", "fit", "update"), 0.0)
         self.notes: dict[str, Any] = {}
         spec = task.dynamics.spec
         self._observed = episodes.nothing(task.observed.observation_dim, spec.action_dim)
@@ -191,11 +188,8 @@ class Agent(ABC, Display):
         checked_whole("total_timesteps", total_timesteps)
         callbacks: Any = [callback] if callable(callback) else [*(callback or ())]
         end = self.num_timesteps + total_timesteps
-        with ExitStack() as stack:
-            for part in callbacks:
-                if isinstance(part, EpisodeCheckpoint):
-                    stack.enter_context(part.locked())
-            stack.enter_context(long_work("learn", "steps", total=max(0, total_timesteps)))
+        work = long_work("learn", "steps", total=max(0, total_timesteps))
+        with locks_of(callbacks), work:
             self._callbacks = callbacks
             if self._random_state is not None:  # a resumed run
                 episodes.set_generators(self._random_state)
@@ -280,8 +274,7 @@ class Agent(ABC, Display):
         self, observation: NDArray[Any], state: Any, begins: NDArray[np.bool_]
     ) -> tuple[NDArray[Any], Any]:
         """Return action and state of `predict`, checked."""
-        with episodes.timed(self.wall_time, "plan"):
-            result: Any = self.predict(observation, state, begins)
+        result: Any = self.predict(observation, state, begins)
         shape = self.env.action_space.shape
         if isinstance(result, tuple) and len(result) == 2:
             action = np.asarray(result[0])
@@ -305,12 +298,7 @@ class Agent(ABC, Display):
         """Update the dynamics by the episodes that are not in them."""
         task, dynamics = self.task, self.task.dynamics
         acted_in = self.model
-        if self.filter is not None and len(self._promises) > self.num_episodes:
-            with episodes.timed(self.wall_time, "fit"):
-                newest = replace(task, dynamics=self.newest_model.dynamics)
-                self._filter, self._estimated = smooth_episodes(
-                    newest, self.filter, self._observed, seed=len(self._promises)
-                )
+        self._estimate_states()
         # Fresh dynamics learn all episodes.
         data = self.recorded_episodes()
         is_new = data.episode >= self.num_episodes
@@ -322,18 +310,13 @@ class Agent(ABC, Display):
             return
         if self.reward_tolerance is not None and task.sensors is None:
             check_functions(task, new, self.reward_tolerance)
-        with episodes.timed(self.wall_time, "fit"):
-            complete = episodes.completed(task, data, self.env)
-            values = learn_dynamics(complete, new, data, self.score_horizons)
-        # The agent improves in the new model before it acts.
-        promises = self._promises[self.num_episodes :]
+        complete = episodes.completed(task, data, self.env)
+        values = learn_dynamics(complete, new, data, self.score_horizons)
+        self.promised_reward = _mean_promise(self._promises[self.num_episodes :])
         self.num_episodes = len(self._promises)
+        # The agent improves in the new model before it acts.
         self.model = None
         self._can_act = None
-        self.promised_reward = None
-        made = [promise for promise in promises if promise is not None]
-        if made and made == promises:
-            self.promised_reward = sum(made) / len(made)
         values["real_reward"] = float(data.rewards[is_new].mean())
         if self.promised_reward is not None:
             values["promised_reward"] = self.promised_reward
@@ -342,6 +325,15 @@ class Agent(ABC, Display):
             warn_of_bounds(dynamics.spec, new, acted_in.state_bounds)
         self.tell("fit", values)
 
+    def _estimate_states(self) -> None:
+        """Estimate the states behind sensors again, if there are new episodes."""
+        if self.filter is None or len(self._promises) == self.num_episodes:
+            return
+        newest = replace(self.task, dynamics=self.newest_model.dynamics)
+        self._filter, self._estimated = smooth_episodes(
+            newest, self.filter, self._observed, seed=len(self._promises)
+        )
+
     def _improve(self) -> None:
         """Improve in the newest model, if there is one."""
         if self._can_act is not None:
@@ -349,8 +341,7 @@ class Agent(ABC, Display):
         task = self.known_task()
         if task is None:
             return
-        with episodes.timed(self.wall_time, "update"):
-            can_act: Any = self.improve(task)
+        can_act: Any = self.improve(task)
         self._check_result("improve", can_act, bool | np.bool_, "True if it can act by now")
         self._can_act = bool(can_act)
         self.model = task if can_act else None
@@ -464,6 +455,14 @@ class Agent(ABC, Display):
         self.model = self.known_task() if self._can_act else None
         if environment is None:
             self._start = None  # it will be reset
+
+
+def _mean_promise(promises: Sequence[float | None]) -> float | None:
+    """Return the mean promise of episodes; None if one of them has none."""
+    made = [promise for promise in promises if promise is not None]
+    if not made or len(made) < len(promises):
+        return None
+    return sum(made) / len(made)
 
 
 def print_progress(agent: Any, event: str, values: dict[str, float]) -> None:

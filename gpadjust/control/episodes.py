@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import random
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -169,7 +168,7 @@ def try_task(task: Task, observations: np.ndarray, env: Any) -> None:
     set_generators(before)
 
 
-# Generators and clocks
+# Generators
 
 
 def generators() -> tuple[Any, ...]:
@@ -185,13 +184,3 @@ def set_generators(state: tuple[Any, ...]) -> None:
     torch.set_rng_state(state[2])
     if state[3] and torch.cuda.is_available():
         torch.cuda.set_rng_state_all(state[3])
-
-
-@contextmanager
-def timed(wall_time: dict[str, float], part: str) -> Iterator[None]:
-    """Add the seconds of a block to a part."""
-    start = time.perf_counter()
-    try:
-        yield
-    finally:
-        wall_time[part] += time.perf_counter() - start

@@ -8,13 +8,12 @@ except ImportError as error:
     ) from error
 
 from gpadjust.rl.buffer import MixedReplayBuffer
-from gpadjust.rl.dyna import Dyna, DynaCallback, DynaSAC, DynaTD3
+from gpadjust.rl.dyna import Dyna, DynaSAC, DynaTD3
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 
 __all__ = [
     "Dyna",
-    "DynaCallback",
     "DynaOptions",
     "DynaSAC",
     "DynaTD3",

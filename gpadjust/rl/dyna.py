@@ -5,7 +5,8 @@ from __future__ import annotations
 import inspect
 import time
 import warnings
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any, ClassVar, Self
 
@@ -29,7 +30,7 @@ from stable_baselines3.common.vec_env import (
 from gpadjust.checks import check_kind
 from gpadjust.control import EpisodeCheckpoint, StepGuard, Task
 from gpadjust.control import episodes as real
-from gpadjust.control.checkpoint import pickled_environment
+from gpadjust.control.checkpoint import locks_of, pickled_environment
 from gpadjust.control.learning import check_functions, learn_dynamics
 from gpadjust.control.summary import agent_table, agent_text
 from gpadjust.display import Display
@@ -39,37 +40,13 @@ from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 
 
-class DynaCallback(BaseCallback):
-    """A Stable-Baselines3 callback with two more hooks, for :class:`Dyna` agents.
-
-    A subclass with ``_init_callback`` must call that of this class.
-    """
-
-    model: Any
-
-    def _init_callback(self) -> None:
-        if not hasattr(self.model, "model_hooks"):
-            raise TypeError(
-                f"{type(self).__name__} is for Dyna agents, such as DynaSAC; found "
-                f"{type(self.model).__name__}."
-            )
-        self.model.model_hooks.append(self)
-
-    def _on_step(self) -> bool:
-        return True
-
-    def on_model_fit(self, metrics: dict[str, float]) -> None:
-        """React to a fit, with the numbers of the event ``"fit"`` of an ``Agent``."""
-
-    def on_model_episodes(self, returns: np.ndarray) -> None:
-        """React to parallel model episodes, with their returns."""
-
-
-class AgentCallback(DynaCallback):
+class AgentCallback(BaseCallback):
     """Calls a callback of :class:`gpadjust.control.Agent` at the corresponding events of Dyna.
 
     A trial is a rollout of Stable-Baselines3 in which an episode ends.
     """
+
+    model: Any
 
     def __init__(self, callback: Any) -> None:
         super().__init__()
@@ -88,9 +65,11 @@ class AgentCallback(DynaCallback):
             return callback
         return AgentCallback(callback)
 
-    def on_model_fit(self, metrics: dict[str, float]) -> None:
-        """Report a fit of the dynamics."""
-        self.callback(self.model, "fit", metrics)
+    def _init_callback(self) -> None:
+        self.model.fit_callbacks.append(self.callback)
+
+    def _on_step(self) -> bool:
+        return True
 
     def _on_rollout_start(self) -> None:
         # The updates of the last episode are done, and the next has not begun.
@@ -153,7 +132,7 @@ class Dyna(OffPolicyAlgorithm, Display):
     """
 
     not_saved: ClassVar[tuple[str, ...]] = (
-        *("env", "task", "model_hooks", "_random_state"),
+        *("env", "task", "fit_callbacks", "_random_state"),
         *("_vec_normalize_env", "_logger", "_custom_logger"),
     )
     replay_buffer: MixedReplayBuffer
@@ -201,7 +180,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         self.owed_updates = 0.0  # fraction of an update, of earlier steps in the model
         self.wall_time = dict.fromkeys(("fit", "rollout", "update"), 0.0)
         self.notes: dict[str, Any] = {}
-        self.model_hooks: list[DynaCallback] = []
+        self.fit_callbacks: list[Any] = []  # of agents
         if kwargs.get("_init_setup_model", True):  # `load` sets the task afterwards
             self._check_task()
         super().__init__(
@@ -252,14 +231,14 @@ class Dyna(OffPolicyAlgorithm, Display):
             check_functions(self.task, data, options.reward_tolerance)
         # Update on real transitions, and on transitions of earlier models.
         buffer.mix = uses_model
-        with real.timed(self.wall_time, "update"):
+        with _timed(self.wall_time, "update"):
             super().train(gradient_steps, batch_size)
         if not is_enough:
             return
         # Update the dynamics by the new episodes.
         metrics: dict[str, float] = {}
         if uses_model:
-            with real.timed(self.wall_time, "fit"):
+            with _timed(self.wall_time, "fit"):
                 horizons = options.score_horizons
                 metrics = learn_dynamics(self.model_task(), data, recorded, horizons)
         buffer.num_learnt = len(recorded)
@@ -269,8 +248,8 @@ class Dyna(OffPolicyAlgorithm, Display):
             self.logger.record(f"model/{name}", value)
         if not uses_model:
             return
-        for hook in self.model_hooks:
-            hook.on_model_fit(metrics)
+        for callback in self.fit_callbacks:
+            callback(self, "fit", metrics)
         # Train in the newest model.
         self._train_in_model(options.model_episodes * num_ended, batch_size)
         total = sum(self.wall_time.values())
@@ -290,14 +269,14 @@ class Dyna(OffPolicyAlgorithm, Display):
         for start in range(0, num_episodes, at_once):
             env = self.model_env(min(num_episodes - start, at_once))
             noise = self._model_noise(env.num_envs)
-            with real.timed(self.wall_time, "rollout"):
+            with _timed(self.wall_time, "rollout"):
                 if start == 0 and self.options.refresh_model_data:
                     env.refresh(self.replay_buffer.model_buffer)
                 obs = env.reset()
             returns = np.zeros(env.num_envs)
             running = np.ones(env.num_envs, dtype=bool)
             while running.any():
-                with real.timed(self.wall_time, "rollout"):
+                with _timed(self.wall_time, "rollout"):
                     # One step of the particles whose episode has not ended, into the buffer.
                     ahead = env.steps_ahead
                     actions = self._act_in_model(obs, noise)
@@ -324,11 +303,9 @@ class Dyna(OffPolicyAlgorithm, Display):
                 updates = int(self.owed_updates + 1e-9) // interval * interval
                 self.owed_updates -= updates
                 if updates:
-                    with real.timed(self.wall_time, "update"):
+                    with _timed(self.wall_time, "update"):
                         super().train(updates, batch_size)
             all_returns.append(returns)
-            for hook in self.model_hooks:
-                hook.on_model_episodes(returns)
         self.logger.record("model/ep_rew_mean", float(np.concatenate(all_returns).mean()))
         self.logger.record("model/left_bounds", num_left)
         if num_steps == num_left == self.replay_buffer.model_buffer.size():
@@ -406,10 +383,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         adapted: Any = [AgentCallback.around(part) for part in callbacks]
         if len(adapted) == 1:
             adapted = adapted[0]
-        with ExitStack() as stack:
-            for part in callbacks:
-                if isinstance(part, EpisodeCheckpoint):
-                    stack.enter_context(part.locked())
+        with locks_of(callbacks):
             return super().learn(total_timesteps, adapted, *args, **kwargs)
 
     def _setup_learn(
@@ -423,7 +397,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         self._check_task()
         if reset_num_timesteps or self._last_obs is None:  # SB3 ends the episodes under way
             self.replay_buffer.end_episodes()
-        self.model_hooks = []  # callbacks with hooks add themselves
+        self.fit_callbacks = []  # callbacks of agents add themselves
         noise = deepcopy(self.action_noise)  # SB3 resets it
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
         observations: Any = self._last_obs
@@ -465,7 +439,7 @@ class Dyna(OffPolicyAlgorithm, Display):
     # Checkpoints
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "task", "model_hooks", "_random_state"]
+        return [*super()._excluded_save_params(), "task", "fit_callbacks", "_random_state"]
 
     @classmethod
     def wrapped(cls, env: GymEnv) -> VecEnv:
@@ -483,7 +457,7 @@ class Dyna(OffPolicyAlgorithm, Display):
     def go_on(self, env: VecEnv, task: Task, environment: Any) -> None:
         """Set environment and task, after the attributes of a checkpoint."""
         self.env, self.task = env, task
-        self.model_hooks = []
+        self.fit_callbacks = []
         self._vec_normalize_env = unwrap_vec_normalize(env)
         *wrappers, inner = _layers(env)
         for layer, state in zip(wrappers, environment[0], strict=True):
@@ -493,6 +467,16 @@ class Dyna(OffPolicyAlgorithm, Display):
         else:
             state, envs = cloudpickle.loads(environment[1])
             vars(inner).update(state, envs=envs)
+
+
+@contextmanager
+def _timed(wall_time: dict[str, float], part: str) -> Iterator[None]:
+    """Add the seconds of a block to a part."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        wall_time[part] += time.perf_counter() - start
 
 
 _OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space", "metadata")

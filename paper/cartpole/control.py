@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import pandas as pd
+from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
 from gpadjust.control import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
-from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
+from gpadjust.rl import DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
 from paper.cartpole import Control, Scenario
 from paper.common.experiment import Run
@@ -65,13 +66,13 @@ def run(experiment: Control, name: str, seed: int) -> Run:
     agent = DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments)
     agent.learn(
         settings.episodes * settings.episode_length,
-        callback=setup.recorder,
+        callback=[setup.recorder, setup.recorder.record_fit],
         log_interval=settings.episodes + 1,  # nothing is shown
     )
     return setup.recorder.found()
 
 
-class Recorder(DynaCallback):
+class Recorder(BaseCallback):
     """Records each episode, and sets the number of updates that follows it.
 
     A record is begun when the episode ends, and finished after the updates, before the next one. An
@@ -106,9 +107,12 @@ class Recorder(DynaCallback):
         shown = {n: column for n, column in columns.items() if any(v is not None for v in column)}
         return {"episodes": shown}
 
-    def on_model_fit(self, metrics: dict[str, float]) -> None:
+    def _on_step(self) -> bool:
+        return True
+
+    def record_fit(self, agent: DynaSAC, event: str, metrics: dict[str, float]) -> None:
         """Record the scores of the model on the episode, once it can predict."""
-        if self._record is not None and "nlpd" in metrics:
+        if self._record is not None and event == "fit" and "nlpd" in metrics:
             errors = [value for name, value in metrics.items() if name.startswith("rmse/")]
             self._record |= {name: metrics[name] for name in ("nlpd", "coverage")}
             self._record["rmse"] = errors

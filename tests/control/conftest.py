@@ -1,5 +1,6 @@
 """The point, agents of both kinds that learn to move it, and short plans."""
 
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ import torch
 
 from gpadjust.control import MPCAgent, Planner, PolicySearch, PolicySearchAgent, Task
 from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.physics import PhysicsError
 from tests.point import *  # noqa: F403
 from tests.point import POINT_SPEC, linear, near_one
 
@@ -22,6 +24,18 @@ quick = partial(Planner, num_random=48, max_hold=1)
 
 def half_step(X):
     return X[:, :1] + 0.5 * X[:, 1:2]
+
+
+def fails_beyond(limit):
+    """The physics of the point, which fails beyond a distance from zero."""
+
+    def physics(X):
+        bad = (X[:, 0].abs() > limit).nonzero().flatten().tolist()
+        if bad:
+            raise PhysicsError("too far", rows=bad)
+        return half_step(X)
+
+    return physics
 
 
 def full_step(X):
@@ -71,6 +85,19 @@ KINDS = {
 def described(agent):
     """What is said of the kind of an agent, or of the one that it is derived from."""
     return next(KINDS[each] for each in type(agent).__mro__ if each in KINDS)
+
+
+@pytest.fixture
+def slow_reward(monkeypatch):
+    """A reward of the point, of which a call takes a second, and the clock."""
+    clock = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+
+    def slow(*transitions):
+        clock[0] += 1.0
+        return to_one(*transitions)
+
+    return slow, clock
 
 
 @pytest.fixture(params=KINDS)

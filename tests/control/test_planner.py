@@ -1,43 +1,19 @@
 """Plans of episodes, and the search that makes them."""
 
 import pickle
-import time
 from dataclasses import replace
 
 import pytest
 import torch
 
-from gpadjust import ZeroMeanGP
 from gpadjust.control import Objective, Planner, Return, Rollouts
 from gpadjust.control.rollouts import random_sequences
-from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import PhysicsError
-from tests.control.conftest import BOUNDS, EVEN, ZERO, half_step, point_of, to_one
+from tests.control.conftest import BOUNDS, EVEN, ZERO, fails_beyond, point_of, to_one
 from tests.point import POINT_SPEC
+from tests.systems import normal
 
 pytestmark = pytest.mark.filterwarnings("ignore:L-BFGS did not converge")
-SEQUENCES = torch.tensor([[[1.0], [2.0], [0.0]], [[0.0], [-1.0], [1.0]]], dtype=torch.float64)
-NEAR = torch.tensor([[-0.8], [0.8]])
-
-
-def fails_beyond(limit):
-    def physics(X):
-        bad = (X[:, 0] > limit).nonzero().flatten().tolist()
-        if bad:
-            raise PhysicsError("too far", rows=bad)
-        return half_step(X)
-
-    return physics
-
-
-@pytest.fixture
-def known_left():
-    """A task whose dynamics x' = x + v / 2 were measured, often, where v is negative."""
-    x = torch.linspace(-3, 3, 40, dtype=torch.float64).unsqueeze(-1)
-    v = -torch.rand(40, 1, dtype=torch.float64)
-    dynamics = LearnedDynamics(POINT_SPEC, model=ZeroMeanGP, fit_options={"method": "map"})
-    dynamics.update(x, v, x + 0.5 * v + 0.01 * torch.randn_like(x))
-    return replace(point_of(), dynamics=dynamics)
 
 
 # Sequences
@@ -86,7 +62,28 @@ def test_the_cross_entropy_method_finds_an_optimum():
     assert torch.equal(kept.actions, best)
 
 
+def test_the_best_sequences_of_earlier_rounds_stay():
+    """Here all later ones are worse, and of these the largest actions best."""
+    calls = []
+
+    class First(Objective):
+        def make_score(self, task):
+            def score(rollout):
+                calls.append(rollout.actions[0])
+                size = rollout.actions[0].sum((-2, -1))
+                return -size.abs() if len(calls) == 1 else size - 100
+
+            return score
+
+    Planner(First(), rounds=3, num_elites=8, num_random=60).plan(point_of(), ZERO, BOUNDS, 4)
+    means = [actions.mean().item() for actions in calls[1:]]
+    assert means == pytest.approx([means[0]] * 3, abs=0.3)
+
+
 # Trials in functions
+
+
+SEQUENCES = torch.tensor([[[1.0], [2.0], [0.0]], [[0.0], [-1.0], [1.0]]], dtype=torch.float64)
 
 
 def test_sequences_are_followed():
@@ -104,22 +101,23 @@ def test_sequences_are_followed():
     [
         ({"terminated": lambda states: states[:, 0] > 1.2}, 3),
         ({"state_bounds": torch.tensor([[-9.0], [1.2]])}, 2),
+        ({"state_bounds": torch.tensor([[5.0], [6.0]])}, 5),  # they give way to the start
         ({"physics": fails_beyond(0.9)}, 2),
     ],
 )
 def test_episodes_end_in_the_model(options, made):
-    sequences = torch.stack([torch.ones(5, 1), -torch.ones(5, 1)]).double()
+    sequences = torch.stack([torch.ones(5, 1), torch.zeros(5, 1)]).double()
     steps = Rollouts(point_of(**options), 2).follow(ZERO, sequences)
     assert steps.made.tolist() == [[[t < made for t in range(5)], [True] * 5]] * 2
-    assert steps.left_bounds.any(-1).tolist() == [["terminated" not in options, False]] * 2
-    if "physics" in options:
-        assert steps.states[steps.made].max() <= 0.9
+    has_left = "terminated" not in options and made < 5
+    assert steps.left_bounds.any(-1).tolist() == [[has_left, False]] * 2
 
 
-def test_all_episodes_may_end_at_once_but_not_at_the_start():
+def test_the_physics_may_fail_for_all_episodes_but_not_at_the_start():
     sequences = torch.ones(2, 5, 1).double()
     steps = Rollouts(point_of(fails_beyond(0.9)), 2).follow(ZERO, sequences)
     assert steps.made.tolist() == [[[True, True, False, False, False]] * 2] * 2
+    assert steps.states[steps.made].max() <= 0.9
     with pytest.raises(PhysicsError, match="too far"):
         Rollouts(point_of(fails_beyond(-1)), 2).follow(ZERO, sequences)
 
@@ -127,23 +125,18 @@ def test_all_episodes_may_end_at_once_but_not_at_the_start():
 # Plans
 
 
-def test_plans_are_those_of_the_generator_with_a_limit_of_time_or_without(known_left):
+def test_plans_are_those_of_the_generator_with_a_limit_of_time_or_without():
     plans = []
     for seed, seconds in ((0, None), (0, 1e3), (1, None)):
         options = pickle.loads(pickle.dumps(Planner(num_random=8, seconds=seconds)))
         torch.manual_seed(seed)
-        plans.append(options.plan(known_left, ZERO, [[-1.0], [2.0]], 3))
+        plans.append(options.plan(point_of(), ZERO, BOUNDS, 3))
     assert torch.equal(plans[0].actions, plans[1].actions)
     assert plans[0].value == plans[1].value
     assert not torch.equal(plans[0].actions, plans[2].actions)
 
 
-def test_bounds_give_way_to_where_an_episode_is():
-    task = point_of(state_bounds=torch.tensor([[5.0], [6.0]]))
-    assert Rollouts(task, 1).follow(ZERO, torch.zeros(1, 3, 1).double()).made.all()
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_staying_is_better_than_leaving_however_few_the_sequences(seed):
     """The first ones may all leave at once, so that there is nothing to compare them with."""
     torch.manual_seed(seed)
@@ -158,16 +151,7 @@ def test_staying_is_better_than_leaving_however_few_the_sequences(seed):
 # Returns
 
 
-def test_a_plan_of_the_greatest_return():
-    """From x = 0 the way to x = 1 and to stay there, by steps of v / 2 with v at most 2."""
-    options = {"num_elites": 8, "correlation": 0.0, "num_random": 200, "max_hold": 1}
-    plan = Planner(Return(), rounds=12, **options).plan(point_of(), ZERO, BOUNDS, 4)
-    assert plan.value > -0.1
-    reached = (plan.actions[:, 0] / 2).cumsum(0)
-    torch.testing.assert_close(reached, torch.ones(4).double(), atol=0.05, rtol=0)
-
-
-def test_a_return_is_the_sum_of_the_rewards_that_are_made():
+def test_a_return_is_the_sum_of_the_rewards_that_are_made_or_a_quantile():
     beyond = (1.5 - 1.2) / 5.1  # in halves of the width
     worst = -0.5 - 1.5 * (2e6 + 40 * beyond)
     for parts, expected in [
@@ -178,22 +162,22 @@ def test_a_return_is_the_sum_of_the_rewards_that_are_made():
         task = point_of(**parts)
         score = Return().make_score(task)(Rollouts(task, 2).follow(ZERO, SEQUENCES))
         torch.testing.assert_close(score, torch.tensor(expected, dtype=torch.float64))
+    rollout = Rollouts(point_of(), 11).follow(ZERO, SEQUENCES)
+    rewards = normal(11, 2, 3)
+    careful = Return(quantile=0.2).make_score(point_of())(rollout._replace(rewards=rewards))
+    torch.testing.assert_close(careful, rewards.sum(-1).sort(0).values[2])  # the third of 11
 
 
 @pytest.mark.parametrize(
-    ("reward", "steps", "rounds", "is_right"),
-    [
-        (to_one, 6, 6, lambda value: value > -3),  # to end early costs least; to stay costs 6
-        (lambda s, a, n: 0 * n[:, 0], 3, 1, lambda value: value == 0),
-    ],
+    ("reward", "steps", "rounds", "least"),
+    [(to_one, 6, 6, -3), (lambda s, a, n: 0 * n[:, 0], 3, 1, 0)],
 )
-def test_a_search_keeps_within_bounds(reward, steps, rounds, is_right):
-    """Most random sequences leave."""
-    torch.manual_seed(0)
-    task = point_of(reward=reward, state_bounds=NEAR)
+def test_a_search_keeps_within_bounds(reward, steps, rounds, least):
+    """Most random sequences leave; to end early would cost least, and to stay costs 6."""
+    task = point_of(reward=reward, state_bounds=torch.tensor([[-0.8], [0.8]]))
     plan = Planner(Return(), rounds=rounds, num_random=64).plan(task, ZERO, BOUNDS, steps)
     assert plan.left_bounds == 0
-    assert is_right(plan.value)
+    assert plan.value >= least
 
 
 # Time
@@ -208,17 +192,10 @@ def test_a_search_keeps_within_bounds(reward, steps, rounds, is_right):
         (99.0, 1, 8, 4),  # all there is to do
     ],
 )
-def test_plans_are_made_in_time(seconds, rounds, taken, planned, monkeypatch):
-    """A step of the model takes 1 s."""
-    clock = [0.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
-
-    def slow(states, actions, next_states):
-        clock[0] += 1.0
-        return to_one(states, actions, next_states)
-
+def test_plans_are_made_in_time(seconds, rounds, taken, planned, slow_reward):
+    reward, clock = slow_reward
     planner = Planner(rounds=rounds, seconds=seconds, num_random=8)
-    plan = planner.plan(point_of(reward=slow), ZERO, BOUNDS, 4)
+    plan = planner.plan(point_of(reward=reward), ZERO, BOUNDS, 4)
     assert clock[0] == taken
     assert len(plan.actions) == len(plan.rewards) == len(plan.next_states) == planned
     assert plan.value == pytest.approx(float(plan.rewards.sum()))
@@ -228,5 +205,3 @@ def test_horizons_are_in_the_time_unit_of_the_step():
     task = point_of(spec=replace(POINT_SPEC, step=0.1), episode_length=9)
     for horizon, planned in ((0.3, 3), (0.1, 1), (5, 9)):
         assert len(Planner(horizon=horizon).plan(task, ZERO, BOUNDS).actions) == planned
-    with pytest.raises(ValueError, match=r"horizon must be one step at least, .* 0\.1 in the time"):
-        Planner(horizon=0.05).plan(task, ZERO, BOUNDS)

@@ -1,5 +1,6 @@
 """Refusals: where an object is made, at a call, and before the first real step."""
 
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -72,17 +73,14 @@ def improve(at, policy=None, **parts):
 
 TASK = [
     (lambda at: at.task(action_rate=0.0), "most of an action rate must be .* above 0"),
-    (lambda at: at.task(action_rate="fast"), "most of an action rate must be a number"),
     (lambda at: at.task(action_rate=[0.1, 0.2]), "one for each of 1 actions; found 2"),
     (lambda at: ActionRate(price=-1.0), r"price must be .* at least 0"),
     (lambda at: at.task(probability=95), "probability must be above 0 and below 1; found 95"),
     (lambda at: at.task(constraints=lambda s: s), "constraints must be .* actions that led to"),
-    (lambda at: at.task(state_bounds=torch.ones(2, 4)), "Expected state_bounds of shape 2 x 1"),
     (lambda at: at.task(state_bounds=[[1.0], [-1.0]]), "state_bounds, each lower one below its up"),
     (lambda at: at.task(episode_length=0), "episode_length must be at least 1; found 0"),
     (lambda at: at.task(dynamics="cka"), "dynamics must be an object of a Dynamics; found 'cka'"),
     (lambda at: at.task(reward=None), "reward must be a function of states, .*found None"),
-    (lambda at: at.task(reward=1.0), "reward must be a function of .*; found 1.0"),
     (lambda at: at.task(reward=lambda s: 0), "states, actions, next states; found <function"),
     (lambda at: at.task(sensors=X), "known starts of episodes"),
     (lambda at: at.task(sensors=["x"]), "sensors"),
@@ -104,20 +102,21 @@ PLANS = [
     (lambda at: Planner(num_random=0), "num_random must be at least 1; found 0"),
     (lambda at: Planner(num_functions=0), "num_functions must be at least 1; found 0"),
     (lambda at: Planner(horizon=0), "horizon must be finite and above 0; found 0"),
+    (lambda at: Planner(rounds=1.5), "rounds must be a whole number; found 1.5"),
     (lambda at: Planner(spread=0.0), "spread must be above 0 and below 1; found 0.0"),
     (lambda at: Planner(max_hold=True), "max_hold must be a whole number; found True"),
     (lambda at: Planner(Return(quantile=0.1), num_functions=1), "but num_functions is 1; give"),
     (lambda at: Return(quantile=1.0), "quantile must be at least 0 and below 1"),
-    (lambda at: Planner(rounds=1.5), "rounds must be a whole number; found 1.5"),
     (lambda at: Planner(correlation=1.0), "correlation must be .* below 1"),
     (lambda at: plan(state=torch.zeros(2)), r"state of shape 1, found \(2,\)"),
     (lambda at: plan(bounds=BOUNDS * torch.inf), r"finite action_bounds, .*inf"),
-    (lambda at: plan(bounds=[[1.0], [-1.0]]), "action_bounds, each lower one below its upper"),
     (lambda at: plan(num_steps=None), "a number of steps >= 1 to plan, found None"),
     (lambda at: plan(Planner(Wrong())), r"Wrong must return one score per seq.* shape \(1, 128\)"),
-    (lambda at: plan(Planner(horizon=0.5)), r"horizon must be one step at least, .* 1 in the time"),
+    (
+        lambda at: plan(Planner(horizon=0.05), task=point_of(spec=replace(POINT_SPEC, step=0.1))),
+        r"horizon must be one step at least, .* 0\.1 in the time",
+    ),
     (lambda at: plan(task=at.task(dynamics=BLIND)), "has not learnt"),
-    (lambda at: MPC(at.task(), BOUNDS, Planner(horizon=0.01)), "horizon must be one step at least"),
     (
         lambda at: MPC(at.task(episode_length=None), BOUNDS, first=Planner()),
         "give the task an episode_length, or the planner a horizon",
@@ -138,18 +137,20 @@ POLICIES = [
 AGENTS = [
     (lambda at: at.searcher(search=3), r"PolicySearch\(...\); found 3"),
     (lambda at: at.searcher(policy="mlp"), "makes a BoundedPolicy .* found 'mlp'"),
-    (lambda at: at.searcher(policy=lambda *_: 3), "BoundedPolicy .* found 3"),
     (lambda at: at.planner(first=3), r"first must be a Planner\(...\); found 3"),
     (lambda at: at.planner(reward_tolerance="no"), "reward_tolerance must be a number"),
     (lambda at: at.planner(score_horizons=(0,)), "horizon"),
     (lambda at: at.planner(learning_rate=1.0), "learning_rate"),
     (lambda at: MPCAgent(at.env(), at.task()).learn("x"), "total_timesteps must be a whole number"),
     (lambda at: MPCAgent(None, at.task()), "env must be an environment of Gymnasium"),
-    (lambda at: MPCAgent("CartPole-v1", at.task()), "env must be an environment of Gymnasium"),
     (lambda at: MPCAgent(at.env(), None), r"task must be a Task.* needs to learn; found"),
     (
         lambda at: MPCAgent(env_of(at, observation_space=BOX(-1, 1, (2,))), at.task()),
         "the observation has 1 entries",
+    ),
+    (
+        lambda at: MPCAgent(env_of(at, observation_space=BOX(-1, 1, (2,))), at.hidden),
+        "spec of the sensors the observation has 1 entries",
     ),
     (
         lambda at: MPCAgent(env_of(at, action_space=gymnasium.spaces.Discrete(2)), at.task()),
@@ -173,7 +174,6 @@ AGENTS = [
 ]
 LATER = [  # at `learn`, before the first real step
     (lambda at: at.searcher(constraints=wall), "PolicySearch .* constraints; MPCAgent can"),
-    (lambda at: at.searcher(action_rate=0.5), "PolicySearch .* action_rate; MPCAgent can"),
     (lambda at: at.planner(dynamics=BLIND, sensors=X), "give the dynamics a physics"),
     (
         lambda at: at.planner(at.env().unwrapped, episode_length=None),

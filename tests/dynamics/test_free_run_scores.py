@@ -81,23 +81,20 @@ def test_the_energy_score_is_a_mean_over_pairs(run, measured):
         assert energy[t].item() == pytest.approx(mean, nan_ok=True)
 
 
-def test_the_energy_of_one_state_without_doubt_is_the_distance_in_typical_steps():
-    spec, x = StateSpec(["x"], ["u"]), torch.arange(5, dtype=torch.float64)
-    fast = PhysicsDynamics(spec, lambda X: X[:, :1] + 1.5 * X[:, 1:])
-    run = fast.free_run(x[:1].unsqueeze(0), 2 * torch.ones(1, 4, 1).double())
-    scores = run.score(2 * x[1:].reshape(1, 4, 1))  # it moves by 2, the run by 3
-    np.testing.assert_allclose(scores.energy, [0.5, 1.0, 1.5, 2.0])
-
-
-def test_windows_where_the_physics_fails_have_no_energy(run, measured):
-    particles = run.particles.clone()
-    particles[0, 1] = torch.nan
-    kept = [0, 2, 3]
-    failing = run._replace(particles=particles)
-    energy = failing.score(measured, units=torch.ones(2).double()).energy
-    others = run_of(run.particles[:, kept])
-    others = others.score(measured[kept], units=torch.ones(2).double()).energy
-    torch.testing.assert_close(energy, others, equal_nan=True)
+def test_chosen_windows_of_records_are_scored_in_typical_steps():
+    spec, x = StateSpec(["x"], ["u"]), torch.arange(13, dtype=torch.float64).unsqueeze(-1)
+    windows = Records(Record(x[:, 0], 2 * x, torch.ones_like(x)), spec).windows(3)
+    assert windows.states[..., 0].tolist() == [
+        [6.0 * w + 2 * t for t in range(4)] for w in range(4)
+    ]
+    late = windows.subset(windows.states[:, 0, 0] > 8)
+    assert late.initial_states.flatten().tolist() == [12, 18]
+    assert torch.equal(windows.subset(torch.tensor([3, 2])).measured, late.measured.flip(0))
+    slow = PhysicsDynamics(spec, lambda X: X[:, :1] + 1.8 * X[:, 1:])
+    scores = slow.free_run(late.initial_states, late.actions).score(late.measured)
+    for errors in (scores.rmse[:, 0], scores.median[:, 0], 2 * scores.energy):
+        np.testing.assert_allclose(errors, [0.2, 0.4, 0.6])
+    assert scores.nlpd.isnan().all()
 
 
 def test_horizons_are_rows_of_all_steps(run, measured):
@@ -135,30 +132,14 @@ def test_particles_without_spread_say_nothing_of_errors(run, measured):
         assert some[1].isnan().all()
         torch.testing.assert_close(some[::2], others[::2], equal_nan=True)
     assert scores.rmse[1].isfinite().all()
-    exact = run_of(run.particles[:1, :1, :1].expand(9, -1, -1, -1)).score(measured[:1, :1])
-    assert exact.coverage.isnan().all()
 
 
-def test_windows_without_an_interval_are_left_out_of_what_judges_it(run, measured):
-    """As where the physics fails at the mean before, so that the noise is not known."""
-    particles = run.particles.clone()
+def test_windows_without_particles_are_left_out_of_what_judges_these(run, measured):
+    """As where the physics fails, so that the noise is not known."""
+    particles, units = run.particles.clone(), torch.ones(2).double()
     particles[:, 0] = torch.nan
-    some = run_of(particles)._replace(mean=run.mean).score(measured)
-    rest = run_of(run.particles[:, 1:]).score(measured[1:])
+    some = run_of(particles)._replace(mean=run.mean).score(measured, units=units)
+    rest = run_of(run.particles[:, 1:]).score(measured[1:], units=units)
     torch.testing.assert_close(some.rmse, run.score(measured).rmse, equal_nan=True)
-    torch.testing.assert_close(some.coverage, rest.coverage, equal_nan=True)
-    torch.testing.assert_close(some.nlpd, rest.nlpd, equal_nan=True)
-
-
-def test_windows_of_records_are_chosen_and_scored():
-    spec, x = StateSpec(["x"], ["u"]), torch.arange(13, dtype=torch.float64).unsqueeze(-1)
-    windows = Records(Record(x[:, 0], x, torch.ones_like(x)), spec).windows(3)
-    assert windows.states[..., 0].tolist() == [[3.0 * w + t for t in range(4)] for w in range(4)]
-    late = windows.subset(windows.states[:, 0, 0] > 4)
-    assert late.initial_states.flatten().tolist() == [6, 9]
-    assert torch.equal(windows.subset(torch.tensor([3, 2])).measured, late.measured.flip(0))
-    slow = PhysicsDynamics(spec, lambda X: X[:, :1] + 0.9 * X[:, 1:])
-    scores = slow.free_run(late.initial_states, late.actions).score(late.measured)
-    np.testing.assert_allclose(scores.rmse[:, 0], [0.1, 0.2, 0.3])
-    np.testing.assert_allclose(scores.median[:, 0], [0.1, 0.2, 0.3])
-    assert scores.nlpd.isnan().all()
+    for name in ("coverage", "nlpd", "energy"):
+        torch.testing.assert_close(getattr(some, name), getattr(rest, name), equal_nan=True)

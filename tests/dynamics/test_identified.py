@@ -7,20 +7,19 @@ from gpadjust.control import MPC, Planner, Task
 from gpadjust.dynamics import IdentifiedDynamics
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, PhysicsParameters, Unknown
 from gpadjust.states import StateSpec
-from tests.systems import normal, same, uniform
+from tests.systems import normal, refused, same, uniform
 
 SPEC = StateSpec(["goal", "x"], ["u"], exogenous=["goal"])
 PRIOR = Unknown(1.0, sd=0.5)
 Q, R = 0.02, 0.1  # standard deviations of process and sensors
 
 
-def made(draws, unknowns=None):
-    """x' = x + a u, with these draws of a."""
+def made(draws, formula="x + a * u", unknowns=None):
+    """x' = x + a u, with these draws of a, or another formula."""
     unknowns = {"a": PRIOR} if unknowns is None else unknowns
-    formula = "x + a * u" if unknowns else "x + u"
-    physics = FormulaPhysics(formula, ["x", "u"], unknowns=unknowns)
-    parameters = PhysicsParameters(unknowns, [draws] if unknowns else [])
+    parameters = PhysicsParameters(unknowns, draws)
     noises = (torch.tensor([0.0, sd]).double() for sd in (R, Q))
+    physics = FormulaPhysics(formula, ["x", "u"], unknowns=unknowns)
     return IdentifiedDynamics(SPEC, physics, parameters, *noises)
 
 
@@ -35,22 +34,23 @@ def moves(number=30):
 def test_its_variance_is_of_parameters_and_process_noise():
     draws = 1.0 + 0.2 * normal(32)
     states, actions, _ = moves()
-    mean, variance = made(draws).predict(states, actions)
+    mean, variance = made([draws]).predict(states, actions)
     torch.testing.assert_close(mean[:, 1:], states[:, 1:] + draws.mean() * actions)
     expected = Q**2 + actions.square() * draws.var(correction=0)
     torch.testing.assert_close(variance[:, 1:], expected)
     assert torch.equal(mean[:, 0], states[:, 0])
     assert not variance[:, 0].any()
-    one = made(draws).predict(states[0], actions[0])
+    one = made([draws]).predict(states[0], actions[0])
     torch.testing.assert_close(one.variance, variance[0])
-    alone, process = made(None, unknowns={}), torch.full((30,), Q**2).double()
+    alone = made([], "x + u", {})
+    process = torch.full((30,), Q**2).double()
     torch.testing.assert_close(alone.predict(states, actions).variance[:, 1], process)
     blocks = states.expand(3, -1, -1), actions.expand(3, -1, -1)
     assert alone.sample_functions(3, seed=0)(*blocks).shape == (3, 30, 2)
 
 
 def test_it_learns_on_as_a_linear_gaussian_model_does():
-    dynamics = made(1.0 + 0.2 * normal(4000, seed=3))
+    dynamics = made([1.0 + 0.2 * normal(4000, seed=3)])
     before = dynamics.physics_parameters["a"]
     states, actions, following = moves()
     dynamics.update(states, actions, following)
@@ -64,15 +64,15 @@ def test_it_learns_on_as_a_linear_gaussian_model_does():
 
 
 def test_it_is_saved_and_loaded():
-    dynamics, other = made(1.0 + 0.2 * normal(9)), made(torch.ones(3).double())
-    other.load_state_dict(dynamics.state_dict())
+    dynamics, other = made([1.0 + 0.2 * normal(9)]), made([torch.ones(3).double()])
+    state = dynamics.state_dict()
+    other.load_state_dict(state)
     states, actions, _ = moves()
     same(other.predict(states, actions), dynamics.predict(states, actions), rtol=0, atol=0)
-    with pytest.raises(RuntimeError, match="unknowns is"):
-        made(None, unknowns={}).load_state_dict(dynamics.state_dict())
-    other.physics = FormulaPhysics("x + a * a * u", ["x", "u"], unknowns={"a": PRIOR})
-    with pytest.raises(RuntimeError, match=r"physics is 'x \+ a \* u' in the state"):
-        other.load_state_dict(dynamics.state_dict())
+    refused(RuntimeError, "unknowns is", made([], "x + u", {}).load_state_dict, state)
+    squared = made([torch.ones(3).double()], "x + a * a * u")
+    words = r"physics is 'x \+ a \* u' in the state"
+    refused(RuntimeError, words, squared.load_state_dict, state)
 
 
 def test_a_controller_plans_in_it_and_learns_on():
@@ -96,13 +96,11 @@ def test_it_predicts_by_the_center_of_a_ridge():
     """Of b and c only the product is known, 2; the mean of b times that of c is far from it."""
     unknowns = {"b": Unknown(1.0, factor=3.0), "c": Unknown(2.0, factor=3.0)}
     b = normal(400).exp()
-    parameters = PhysicsParameters(unknowns, [b, 2.0 / b])
-    assert parameters.mean.prod() > 4.0
+    dynamics = made([b, 2.0 / b], "x + b * c * u", unknowns)
+    assert dynamics.physics_parameters.mean.prod() > 4.0
     center = b.log().mean().exp()
-    torch.testing.assert_close(parameters.center, torch.stack([center, 2.0 / center]))
-    physics = FormulaPhysics("x + b * c * u", ["x", "u"], unknowns=unknowns)
-    noises = (torch.tensor([0.0, sd]).double() for sd in (R, Q))
-    dynamics = IdentifiedDynamics(SPEC, physics, parameters, *noises)
+    expected = torch.stack([center, 2.0 / center])
+    torch.testing.assert_close(dynamics.physics_parameters.center, expected)
     states, actions, _ = moves()
     mean, variance = dynamics.predict(states, actions)
     torch.testing.assert_close(mean[:, 1:], states[:, 1:] + 2.0 * actions)

@@ -25,8 +25,8 @@ def holed(cart_pole_system):
 
 @pytest.mark.slow
 def test_each_state_is_learnt_from_its_own_rows(cart_pole_system, make, costly_kind, holed):
-    system, test, kind = cart_pole_system, cart_pole_system.trial(9)[:2], costly_kind
-    dynamics = make(kind, system.spec, system.crude)
+    system, test = cart_pole_system, cart_pole_system.trial(9)[:2]
+    dynamics = make(costly_kind, system.spec, system.crude)
     dynamics.update(*holed)
     inputs = dynamics.targets.inputs(*test)
     for column in range(4):
@@ -38,29 +38,12 @@ def test_each_state_is_learnt_from_its_own_rows(cart_pole_system, make, costly_k
         same(ours, theirs, rtol=1e-4, atol=1e-7)
 
 
-def test_scores_are_over_what_was_measured(cart_pole_system, learnt_cart_pole, holed):
-    system, dynamics = cart_pole_system, learnt_cart_pole
-    scores = dynamics.score(*holed)
-    for column in range(4):
-        known = ~holed[2][:, column].isnan()
-        whole = dynamics.score(*(t[known] for t in system.trial(0)))
-        for name in ("rmse", "median", "nlpd", "crps", "coverage"):
-            pair = (getattr(each, name)[column] for each in (scores, whole))
-            torch.testing.assert_close(*pair)
-
-
-@pytest.mark.slow
-def test_a_state_that_is_seldom_measured(cart_pole_system, make):
-    system = cart_pole_system
-    trials = [system.trial(seed) for seed in range(8)]
-    states, actions, next_states = (torch.cat(parts) for parts in zip(*trials, strict=True))
-    next_states[1:150, 3] = next_states[151:, 3] = math.nan
-    dynamics = make("GP", system.spec, None)
-    dynamics.update(*(t[:2] for t in trials[0]))
-    dynamics.update(states, actions, next_states)  # searches on some of the rows
-    assert dynamics.score(*system.trial(9)).rmse.isfinite().all()
-    with pytest.raises(ValueError, match="from, got 1 with a measured 'omega'"):
-        make("GP", system.spec, None).update(states[:150], actions[:150], next_states[:150])
+def test_a_state_that_is_measured_once_is_refused(cart_pole_system, make):
+    states, actions, following = cart_pole_system.trial(0)
+    following = torch.cat([following[:, :3], torch.full_like(actions, math.nan)], -1)
+    following[0, 3] = 0.0
+    update = make("GP", cart_pole_system.spec, None).update
+    refused(ValueError, "from, got 1 with a measured 'omega'", update, states, actions, following)
 
 
 def test_a_row_of_nothing_is_refused(cart_pole_system, learnt_cart_pole, make, holed):

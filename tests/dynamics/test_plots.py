@@ -14,21 +14,15 @@ mpl.use("Agg")
 SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
 
 
-def turns(num_windows=4, num_steps=20):
-    """Windows of an angle that turns at a rate of 7 v, from -pi to pi, and its dynamics."""
-    v = torch.linspace(0.5, 1, num_windows, dtype=torch.float64)
-    angle = 3 + 0.7 * torch.arange(num_steps + 1).double() * v.unsqueeze(-1)
-    angle = torch.atan2(angle.sin(), angle.cos())
-    states = torch.stack([angle, v.unsqueeze(-1).expand_as(angle)], -1)
-    actions = torch.zeros(num_windows, num_steps, 1, dtype=torch.float64)
-    windows = Windows(
-        states[:, 0] + torch.tensor([4 * math.pi, 0.0], dtype=torch.float64), actions, states[:, 1:]
-    )
-
-    def physics(X):
-        return torch.stack([X[:, 0] + 0.7 * X[:, 1], X[:, 1]], -1)
-
-    run = PhysicsDynamics(SPEC, physics).free_run(windows.initial_states, actions)
+def turns():
+    """Four windows of an angle that turns at a rate of 7 v, from -pi to pi, and its free runs."""
+    v = torch.linspace(0.5, 1, 4, dtype=torch.float64).unsqueeze(-1)
+    angle = 3 + 0.7 * torch.arange(21).double() * v
+    states = torch.stack([torch.atan2(angle.sin(), angle.cos()), v.expand_as(angle)], -1)
+    start = states[:, 0] + torch.tensor([4 * math.pi, 0.0], dtype=torch.float64)
+    windows = Windows(start, torch.zeros(4, 20, 1).double(), states[:, 1:])
+    turn = PhysicsDynamics(SPEC, lambda X: torch.stack([X[:, 0] + 0.7 * X[:, 1], X[:, 1]], -1))
+    run = turn.free_run(*windows[:2])
     return windows, run._replace(lower=run.mean - 0.3, upper=run.mean + 0.3)
 
 

@@ -1,10 +1,9 @@
 """Trajectories: where episodes end, and windows within them."""
 
-import pytest
 import torch
 
 from gpadjust.dynamics import StateSpec, Trajectories
-from gpadjust.dynamics.trajectories import Windows
+from tests.systems import refused
 
 SPEC = StateSpec(["x"], ["u"])
 
@@ -23,16 +22,13 @@ def starts(windows):
 def test_windows_do_not_cross_the_ends_of_episodes():
     data = count(6, 3, 8)
     assert data.longest == 8
-    numbers = [len(data.windows(k, stride=1).actions) for k in (1, 4, 8)]
-    assert numbers == [17, 8, 1]
+    assert [len(data.windows(k, stride=1).actions) for k in (1, 4, 8)] == [17, 8, 1]
     assert starts(data.windows(4)) == [0, 9, 13]
     assert starts(data.windows(3, stride=2)) == [0, 2, 6, 9, 11, 13]
     windows = data.windows(3)
-    assert isinstance(windows, Windows)
     assert torch.equal(windows.states[..., 0].diff(dim=1), torch.ones(5, 3).double())
     assert torch.equal(windows.actions[..., 0], 10 * windows.states[:, :-1, 0])
-    with pytest.raises(ValueError, match=r"stretches of 9 steps .* longest stretch has 8"):
-        data.windows(9)
+    refused(ValueError, r"stretches of 9 steps .* longest stretch has 8", data.windows, 9)
 
 
 def test_a_row_that_is_left_out_ends_an_episode():
@@ -75,8 +71,6 @@ def test_episodes_and_lengths_that_are_none():
         ([[0, 0, 0]] * 3, "equally many rows"),
         ([0.5, 0.75, 0.75], r"whole numbers, found \[0.5, 0.75"),
     ):
-        with pytest.raises(ValueError, match=words):
-            Trajectories(x, x, x, episode)
-    for length, stride, words in ((0, None, "length must be"), (2, 0, "stride must be")):
-        with pytest.raises(ValueError, match=words):
-            count(5).windows(length, stride=stride)
+        refused(ValueError, words, Trajectories, x, x, x, episode)
+    refused(ValueError, "length must be", count(5).windows, 0)
+    refused(ValueError, "stride must be", count(5).windows, 2, stride=0)

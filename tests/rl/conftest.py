@@ -2,16 +2,12 @@
 
 from dataclasses import fields
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.control import Task
-from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.rl import DynaOptions, DynaSAC, ModelVecEnv
-from gpadjust.systems.swing_up import CART_POLE_SPEC, REAL_CART_POLE, equation_physics
 from tests.point import *  # noqa: F403
 from tests.point import assert_equal
 
@@ -40,18 +36,6 @@ def point_agent(point_env, point_task):
         return algorithm(env=env, task=task, options=options, **{**defaults, **given})
 
     return make
-
-
-@pytest.fixture
-def cart_pole():
-    """Makes the cart-pole's environment."""
-    return lambda **options: gymnasium.make("gpadjust/CartPoleSwingUp-v0", **options)
-
-
-@pytest.fixture
-def cart_pole_dynamics():
-    """The real cart-pole."""
-    return PhysicsDynamics(CART_POLE_SPEC, equation_physics(REAL_CART_POLE))
 
 
 @pytest.fixture
@@ -99,12 +83,6 @@ def point_particles(point_env, point_task):
         return ModelVecEnv(task, num_envs, *spaces, **given)
 
     return make
-
-
-@pytest.fixture
-def rise():
-    """An action of 1 for each particle."""
-    return lambda n: np.ones((n, 1), dtype=np.float32)
 
 
 def model_rows(agent):

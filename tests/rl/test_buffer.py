@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.rl import MixedReplayBuffer
 from tests.point import assert_equal
 from tests.rl.conftest import COLUMNS
+from tests.systems import same
 
 OBSERVATIONS = spaces.Box(-np.inf, np.inf, (2,))
 ACTIONS = spaces.Box(-1, 1, (1,))
@@ -43,9 +43,7 @@ def rows(values):
     return obs, obs + 0.5, obs[:, :1] / 100, values, none, none
 
 
-@pytest.mark.parametrize(
-    ("batch_size", "fraction"), [(10, 0.25), (11, 1 / 11), (3, 0.5), (8, 0.1), (16, 0.0), (16, 1.0)]
-)
+@pytest.mark.parametrize(("batch_size", "fraction"), [(11, 1 / 11), (3, 0.5), (8, 0.1), (16, 1.0)])
 def test_batches_hold_the_promised_share(buffer, batch_size, fraction):
     np.random.seed(0)  # noqa: NPY002 - the generator that SB3 uses
     made = buffer(20, 20, n_envs=2, real_fraction=fraction)
@@ -58,12 +56,9 @@ def test_batches_hold_the_promised_share(buffer, batch_size, fraction):
 
 def test_a_sample_is_a_whole_row(buffer):
     batch = buffer(20, 20, real_fraction=0.5).sample(32)
-    for part, expected in [
-        (batch.observations, batch.rewards.expand(-1, 2)),
-        (batch.next_observations, batch.rewards.expand(-1, 2) + 0.5),
-        (batch.actions, batch.rewards / 100),
-    ]:
-        np.testing.assert_allclose(part, expected, rtol=1e-6)
+    obs = batch.rewards.expand(-1, 2)
+    found = batch.observations, batch.next_observations, batch.actions
+    same(found, (obs, obs + 0.5, batch.rewards / 100), rtol=1e-6, atol=0)
 
 
 def test_one_buffer_serves_where_the_other_does_not(buffer):
@@ -79,61 +74,56 @@ def test_one_buffer_serves_where_the_other_does_not(buffer):
 
 
 def test_terminations_by_the_time_limit_are_not_dones(buffer):
-    made = buffer(0, 0)
-    obs, following, actions, rewards, _, _ = rows(np.arange(1, 4))
+    made = buffer()
     dones, timeouts = np.array([0, 1, 1], dtype=bool), np.array([0, 0, 1], dtype=bool)
-    made.add_model_rows(obs, following, actions, rewards, dones, timeouts)
+    made.add_model_rows(*rows(np.arange(1, 4))[:4], dones, timeouts)
     batch = made.sample(64)
     np.testing.assert_array_equal(batch.dones, batch.rewards == 2)
 
 
-@pytest.mark.parametrize("chunks", [[3, 4], [7, 2, 5], [10], [4, 10], [3, 23], [25, 1], [0, 2]])
+@pytest.mark.parametrize("chunks", [[3, 4], [7, 2, 5], [4, 10], [3, 23], [0, 2]])
 def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
-    mixed, one = buffer(buffer_size=10), buffer(buffer_size=10)
-    many = mixed.model_buffer
-    start = 1
+    mixed, one, end = buffer(buffer_size=10), buffer(buffer_size=10), 1
     for size in chunks:
-        mixed.add_model_rows(*rows(np.arange(start, start + size)))
-        start += size
-    one.add(*real_row(1))
-    one.extend(*zip(*map(real_row, range(2, start)), strict=True))
+        mixed.add_model_rows(*rows(np.arange(end, end + size)))
+        end += size
+    one.extend(*zip(*map(real_row, range(1, end)), strict=True))
 
     def in_order(buffer):
         first = buffer.pos if buffer.full else 0
         places = (first + np.arange(buffer.size())) % buffer.buffer_size
         return [getattr(buffer, name)[places, 0].tolist() for name in COLUMNS]
 
-    assert many.size() == one.size()
-    assert in_order(many) == in_order(one)
+    assert mixed.model_buffer.size() == one.size()
+    assert in_order(mixed.model_buffer) == in_order(one)
     one.add_model_rows(*rows(np.arange(3)))
     one.reset()
     assert one.size() == one.model_buffer.size() == len(one.episodes) == 0
 
 
-@pytest.mark.parametrize("num_rows", [0, 4, 50, 70])
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
-def test_a_copy_goes_on_as_the_buffer_would(buffer, num_rows, copied):
+@pytest.mark.parametrize("num_rows", [0, 4, 70])
+def test_a_copy_goes_on_as_the_buffer_would(buffer, num_rows):
     made = buffer(num_rows, num_rows, real_fraction=0.3)
     content = []
-    for side in (made, copied(made)):
+    for side in (made, copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
         side.add(*real_row(99))
         side.add_model_rows(*rows(np.array([-98, -99])))
         np.random.seed(1)  # noqa: NPY002
         parts = [(each.pos, each.full, each.observations) for each in (side, side.model_buffer)]
         content.append([*side.sample(40)[:-1], parts])
-    assert_equal(*content)
+    assert_equal(content[1:], content[:1] * 2)
 
 
-def test_samples_are_normalised(buffer, point_env):
-    normalizer = VecNormalize(DummyVecEnv([point_env]))
+def test_samples_are_normalised(buffer, normalised):
+    normalizer, batches = normalised(), []
     normalizer.observation_space = OBSERVATIONS
     normalizer.obs_rms.mean, normalizer.obs_rms.var = np.array([1.0, 2.0]), np.array([4.0, 4.0])
     normalizer.ret_rms.var = np.array(100.0)
     made = buffer(5, 5, real_fraction=0.5)
-    np.random.seed(2)  # noqa: NPY002
-    plain = made.sample(20)
-    np.random.seed(2)  # noqa: NPY002
-    batch = made.sample(20, normalizer)
+    for given in (None, normalizer):
+        np.random.seed(2)  # noqa: NPY002
+        batches.append(made.sample(20, given))
+    plain, batch = batches
     for name in ("observations", "next_observations"):
         expected = (getattr(plain, name) - np.array([1.0, 2.0])) / 2
         np.testing.assert_allclose(getattr(batch, name), expected, rtol=1e-4)
@@ -159,14 +149,14 @@ def played(num_steps, n_envs=1, failing=()):
 
 def test_episodes_that_have_ended_are_in_the_users_units():
     """Also of steps that the learner has forgotten, as there is room for five."""
-    found = played(8).episodes  # of the third episode, which goes on, there is nothing yet
+    made = played(8)
+    found = made.episodes  # of the third episode, which goes on, there is nothing yet
     assert found.states.dtype == found.actions.dtype == torch.float64
     assert found.states[:, 0].tolist() == found.rewards.neg().tolist() == [0, 1, 2, 3, 4, 5]
     assert torch.equal(found.next_states, found.states + 0.5)
     assert torch.equal(found.actions, torch.ones(6, 1).double())
     assert found.steps.tolist() == 2 * [1, 2, 3]
     assert found.terminated.tolist() == 5 * [False] + [True]
-    made = played(8)
     made.end_episodes()
     assert made.episodes.states[6:, 0].tolist() == [6, 7]
 

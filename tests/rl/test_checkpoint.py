@@ -7,10 +7,10 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from gpadjust import systems
 from gpadjust.control import EpisodeCheckpoint, resume
 from gpadjust.rl import DynaSAC, DynaTD3
-from tests.point import PowerCut, Shouting, forbid_unpickling, robot, scramble
+from tests.point import PowerCut, forbid_unpickling, robot, scramble
+from tests.systems import refused
 
 TOTAL = 20  # four episodes of the point
 
@@ -39,10 +39,6 @@ def wrapped(point_env):
     return make
 
 
-def go_on(agent, *callbacks):
-    return agent.learn(TOTAL - agent.num_timesteps, [*callbacks], reset_num_timesteps=False)
-
-
 @pytest.fixture
 def interrupted(assert_same, tmp_path):
     """Asserts that a run that is cut at a step ends as one that is not; from where it goes on."""
@@ -54,6 +50,8 @@ def interrupted(assert_same, tmp_path):
         scramble()
         second = resumed(path)
         start = second.num_timesteps
+        with FileLock(f"{path}.lock"), pytest.raises(RuntimeError, match="Another run writes"):
+            second.learn(1, EpisodeCheckpoint(path))  # which does not spend the generators
         scramble()
         second.learn(total - start, [EpisodeCheckpoint(path)], reset_num_timesteps=False)
         assert_same(whole, second)
@@ -64,42 +62,31 @@ def interrupted(assert_same, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("layers", [("normalised",), ("monitored", "normalised"), ()])
-@pytest.mark.parametrize("learns", [False, True])
+@pytest.mark.parametrize(
+    ("layers", "sampling"), [(("monitored", "normalised"), "step"), ((), "trajectory")]
+)
 def test_a_run_that_was_interrupted_ends_as_one_that_was_not(
-    point_dynamics, sampled_dynamics, layers, learns, point_agent, point_task, wrapped, interrupted
+    learnt_dynamics, layers, sampling, point_agent, point_task, wrapped, interrupted
 ):
-    def parts():
-        return {"dynamics": sampled_dynamics() if learns else point_dynamics}
-
     def agent():
-        return point_agent(wrapped(layers), **parts(), updates_per_model_step=0.7)
+        options = {"updates_per_model_step": 0.7, "sampling": sampling}
+        return point_agent(wrapped(layers), dynamics=learnt_dynamics(), **options)
 
     def resumed(path):
-        return resume(path, wrapped(layers), point_task(**parts()))
+        return resume(path, wrapped(layers), point_task(dynamics=learnt_dynamics()))
 
-    step = 13 if learns else 6
-    assert interrupted(agent, resumed, step) == step // 5 * 5
-
-
-def test_many_interruptions(point_agent, point_task, point_env, assert_same, tmp_path):
-    path = tmp_path / "run.ckpt"
-    whole = point_agent(learning_starts=7).learn(TOTAL)
-    agent = point_agent(learning_starts=7)  # the action space draws the first actions
-    for step in (4, 6, 8, 19):
-        with pytest.raises(PowerCut):
-            go_on(agent, EpisodeCheckpoint(path), CutAt(step))
-        scramble()
-        agent = resume(path, point_env(), point_task())
-    assert_same(whole, go_on(agent))
+    assert interrupted(agent, resumed, 13) == 10
 
 
 def test_steps_in_the_middle_of_episodes(point_agent, point_task, point_env, interrupted):
+    """The first actions are of the action space, which has a generator of its own."""
+    env = lambda: DummyVecEnv([point_env, point_env])  # noqa: E731
+
     def agent():
-        return point_agent(DummyVecEnv([point_env, point_env]), train_freq=(3, "step"))
+        return point_agent(env(), train_freq=(3, "step"), learning_starts=16)
 
     def resumed(path):
-        return resume(path, DummyVecEnv([point_env, point_env]), point_task())
+        return resume(path, env(), point_task())
 
     assert interrupted(agent, resumed, 16, TOTAL + 4) == 12
 
@@ -115,33 +102,6 @@ def test_td3_goes_on(point_agent, point_env, point_task, interrupted):
     assert interrupted(agent, resumed, 14, TOTAL + 1) % 5  # within an episode
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sampling", ["step", "trajectory"])
-def test_cart_pole_of_co_kriging(sampling, cart_pole, point_agent, interrupted):
-    def parts():
-        return VecNormalize(DummyVecEnv([cart_pole])), systems.cart_pole().task()
-
-    def agent():
-        env, task = parts()
-        return point_agent(env, task=task, sampling=sampling, updates_per_model_step=1)
-
-    assert interrupted(agent, lambda path: resume(path, *parts()), 88, 100) == 75
-
-
-def test_a_refused_call_does_not_spend_the_generators(
-    point_agent, point_env, point_task, assert_same, tmp_path
-):
-    path = tmp_path / "run.ckpt"
-    whole = point_agent().learn(TOTAL)
-    with pytest.raises(PowerCut):
-        point_agent().learn(TOTAL, [EpisodeCheckpoint(path), CutAt(13)])
-    agent = resume(path, point_env(), point_task())
-    with FileLock(f"{path}.lock"), pytest.raises(RuntimeError, match="Another run writes"):
-        go_on(agent, EpisodeCheckpoint(path))
-    scramble()
-    assert_same(whole, go_on(agent, EpisodeCheckpoint(path)))
-
-
 def test_an_environment_that_cannot_be_pickled_is_reset_but_its_wrappers_keep_their_statistics(
     point_agent, point_env, point_task, tmp_path
 ):
@@ -149,31 +109,27 @@ def test_an_environment_that_cannot_be_pickled_is_reset_but_its_wrappers_keep_th
         env = robot(point_env())
         return VecNormalize(DummyVecEnv([lambda: env]))
 
-    path = tmp_path / "run.ckpt"
-    agent = point_agent(normalised())
+    path, agent = tmp_path / "run.ckpt", point_agent(normalised())
     agent.notes["costs"] = [1.0]
     with pytest.warns(UserWarning, match="environment cannot be pickled"):
         agent.learn(10, CallbackList([EpisodeCheckpoint(path)]))
     again = resume(path, normalised(), point_task())
     assert again.notes == {"costs": [1.0]}
     assert again.get_vec_normalize_env().obs_rms.count == agent.env.obs_rms.count
-    go_on(again)
-    assert again.num_episodes == 4
-    assert again.replay_buffer.size() == TOTAL
+    assert again.learn(10, reset_num_timesteps=False).num_episodes == 4
 
 
 def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
     point_agent, point_env, point_task, wrapped, tmp_path, monkeypatch
 ):
-    path, two = tmp_path / "run.ckpt", DummyVecEnv([point_env] * 2)
-    EpisodeCheckpoint(path).write(point_agent().learn(5))
-    EpisodeCheckpoint(tmp_path / "two").write(point_agent(two, train_freq=1))
+    one, two = tmp_path / "one", tmp_path / "two"
+    EpisodeCheckpoint(one).write(point_agent().learn(5))
+    env = DummyVecEnv([point_env] * 2)
+    EpisodeCheckpoint(two).write(point_agent(env, train_freq=1))
     forbid_unpickling(monkeypatch)
-    for file, env, algorithm, message in [
-        (path, Shouting(point_env()), DynaSAC, "DummyVecEnv of StepGuard of Monitor of Shout"),
-        (path, wrapped(["normalised"]), DynaSAC, "environment is"),
-        (path, point_env(), DynaTD3, "of another run: agent is .*:DynaSAC in .*:DynaTD3 here"),
-        (tmp_path / "two", point_env(), DynaSAC, "num_envs is 2 in the checkpoint, 1 here"),
+    for path, env, algorithm, message in [
+        (one, wrapped(["normalised"]), DynaSAC, "environment is"),
+        (one, point_env(), DynaTD3, "of another run: agent is .*:DynaSAC in .*:DynaTD3 here"),
+        (two, point_env(), DynaSAC, "num_envs is 2 in the checkpoint, 1 here"),
     ]:
-        with pytest.raises(ValueError, match=message):
-            resume(file, env, point_task(), algorithm)
+        refused(ValueError, message, resume, path, env, point_task(), algorithm)

@@ -1,10 +1,8 @@
 """What an iteration of Dyna does: real steps, updates, model, model episodes."""
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
@@ -21,7 +19,6 @@ POINT_FIT = {"method": "map"}
     ("options", "updates"),
     [
         ({}, 3 * (5 + 10)),
-        ({"updates_per_model_step": 2}, 3 * (5 + 20)),
         ({"updates_per_model_step": 0}, 3 * 5),
         ({"updates_per_model_step": 0.3}, 3 * (5 + 3)),
         ({"updates_per_model_step": 0.25}, 3 * 5 + 7),  # of 7.5
@@ -29,7 +26,6 @@ POINT_FIT = {"method": "map"}
         ({"model_episodes": 5, "num_particles": 2}, 3 * (5 + 25)),
         ({"gradient_steps": 2}, 3 * (2 + 10)),
         ({"last_model_episode": 2}, 3 * 5 + 2 * 10),
-        ({"last_model_episode": 0}, 3 * 5),
         ({"episode_length": 3}, 3 * (5 + 6)),
         ({"learning_starts": 5}, 2 * 5 + 3 * 10),
         ({"train_freq": (2, "episode")}, 2 * 10 + 4 * 10),
@@ -41,7 +37,8 @@ def test_updates_are_as_many_as_promised(point_agent, options, updates):
 
 
 def test_model_rows_are_transitions_of_the_model(point_agent):
-    agent = point_agent(terminated=lambda states: states[:, 0] > 9).learn(10)
+    ends = {"terminated": lambda states: states[:, 0] > 9, "episode_length": None}
+    agent = point_agent(**ends).learn(10)
     rows = agent.replay_buffer.model_buffer
     assert agent.num_timesteps == agent.replay_buffer.size() == 10
     assert agent.num_episodes == 2
@@ -57,19 +54,6 @@ def test_model_rows_are_transitions_of_the_model(point_agent):
     np.testing.assert_array_equal(dones, timeouts)
 
 
-def test_states_beyond_the_bounds_are_not_followed(point_agent):
-    bounds = torch.tensor([[0.9], [1.1]])
-    agent = point_agent(state_bounds=bounds, initial_states=lambda n: torch.ones(n, 1)).learn(10)
-    rows, n = agent.replay_buffer.model_buffer, model_rows(agent)
-    assert 0 < n < 2 * 2 * 5
-    following = rows.next_observations[:n]
-    assert ((following > 0.9) & (following < 1.1)).all()
-    stayed = (following == rows.observations[:n]).all(-1)[:, 0]
-    assert stayed.any()
-    assert rows.timeouts[:n, 0][stayed].all()
-    assert rows.rewards[:n, 0][stayed].max() <= rows.rewards[:n, 0][~stayed].min(initial=0)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [DynaSAC, DynaTD3])
 def test_a_trivial_task_is_improved(point_agent, algorithm):
@@ -83,18 +67,15 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
     options |= {"learning_rate": 1e-2, "batch_size": 32, "gamma": 0.5, "tau": 0.05}
     agent = point_agent(algorithm=algorithm, policy_kwargs={"net_arch": [16]}, **options)
     before = cost(agent)
-    agent.learn(30)
-    assert cost(agent) < 0.2 * before
+    assert cost(agent.learn(30)) < 0.2 * before
 
 
 def test_options_of_the_model_are_taken(point_agent):
     starts = {"initial_states": lambda n: torch.full((n, 1), 0.25)}
-    one = point_agent(**starts, train_freq=(15, "step"), model_episodes=4, buffer_size=50).learn(15)
-    assert one.num_episodes == 3  # each is followed by its episodes in the model
-    assert model_rows(one) == 50 < 3 * 4 * 5
-    assert (one.replay_buffer.model_buffer.observations[10:12] == 0.25).all()
-    other = point_agent(seed=1).learn(10)
-    assert (one.replay_buffer.rewards[:5] != other.replay_buffer.rewards[:5]).any()
+    agent = point_agent(**starts, train_freq=(15, "step"), model_episodes=4, buffer_size=50)
+    assert agent.learn(15).num_episodes == 3  # each is followed by its episodes in the model
+    assert model_rows(agent) == 50 < 3 * 4 * 5
+    assert (agent.replay_buffer.model_buffer.observations[10:12] == 0.25).all()
 
 
 def test_episodes_that_terminate_in_the_model_end_there(point_agent, point_env):
@@ -113,8 +94,8 @@ def test_after_last_model_episode_batches_hold_no_model_rows(point_agent):
     buffer, mixed = agent.replay_buffer, []
     sample = buffer.sample
     buffer.sample = lambda *args, **options: mixed.append(buffer.mix) or sample(*args, **options)
-    agent.learn(20)
-    assert mixed == [True] * 2 * (5 + 10) + [False] * 2 * 5
+    agent.learn(15)
+    assert mixed == [True] * 2 * (5 + 10) + [False] * 5
     assert model_rows(agent) == 2 * 2 * 5
 
 
@@ -128,18 +109,14 @@ def test_dynamics_learn_each_real_transition_once(point_agent, learnt_dynamics):
         agent.learn(10, reset_num_timesteps=reset)
     assert torch.equal(torch.cat(batches), agent.recorded_episodes().states)
     assert [len(states) for states in batches] == [10, 5, 5]
-    assert agent.num_episodes == dynamics.num_transitions // 5 == 4
-
-
-class Stop(BaseCallback):
-    """Stops a run at a step."""
-
-    def _on_step(self):
-        return self.num_timesteps < 8
 
 
 def test_a_run_that_was_stopped_within_a_episode_starts_another(point_agent, learnt_dynamics):
-    agent = point_agent(dynamics=learnt_dynamics()).learn(10, callback=Stop())
+    def stop(local_names, global_names):
+        return agent.num_timesteps < 8
+
+    agent = point_agent(dynamics=learnt_dynamics())
+    agent.learn(10, callback=stop)
     assert agent.replay_buffer.size() == 7  # what a callback stops at is not stored
     agent.learn(10, reset_num_timesteps=False)
     episodes = agent.recorded_episodes()
@@ -165,29 +142,6 @@ def test_a_first_episode_of_a_single_step_waits_for_the_second(
     agent.learn(2, reset_num_timesteps=False)
     assert agent.num_episodes == agent.task.dynamics.num_transitions == 3
     assert agent._n_updates == 3 + 3 * 2
-
-
-def pendulum_step(X):
-    """Pendulum-v1 of Gymnasium."""
-    theta, speed, torque = X.unbind(-1)
-    speed = (speed + (15 * theta.sin() + 3 * torque) * 0.05).clamp(-8, 8)
-    return torch.stack([theta + speed * 0.05, speed], dim=-1)
-
-
-def pendulum_reward(states, actions, next_states):
-    theta, speed = states.unbind(-1)
-    theta = torch.atan2(theta.sin(), theta.cos())
-    return -(theta.square() + 0.1 * speed.square() + 0.001 * actions[:, 0].square())
-
-
-def test_a_system_with_an_angle_of_another_order(point_agent):
-    """Its observations have the cosine first; it is wrapped as the guide says."""
-    env = gymnasium.make("Pendulum-v1", max_episode_steps=8)
-    space = gymnasium.spaces.Box(-8, 8, (3,))
-    env = gymnasium.wrappers.TransformObservation(env, lambda seen: seen[[1, 0, 2]], space)
-    spec = StateSpec(["theta", "speed"], ["torque"], angles=["theta"])
-    task = {"dynamics": PhysicsDynamics(spec, pendulum_step), "reward": pendulum_reward}
-    assert model_rows(point_agent(env, **task, episode_length=None).learn(16)) == 2 * 2 * 8
 
 
 def test_actions_taken_in_the_model_are_remembered(point_agent, point_env):

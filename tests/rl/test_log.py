@@ -9,7 +9,6 @@ import torch
 from stable_baselines3.common.callbacks import (
     CheckpointCallback,
     EvalCallback,
-    EveryNTimesteps,
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.env_util import make_vec_env
@@ -18,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from gpadjust.control import print_progress
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.rl import DynaCallback
+from tests.point import POINT_SPEC
 from tests.rl.conftest import model_rows
 
 
@@ -36,16 +35,21 @@ def test_metrics_of_the_model_are_logged(point_agent, learnt_dynamics, tmp_path)
     assert float(last["model/left_bounds"]) == 0
 
 
-def test_particles_that_left_the_bounds_are_logged_once(point_agent, point_dynamics):
-    runaway = PhysicsDynamics(
-        point_dynamics.spec, lambda X: X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
-    )
+def test_particles_that_left_the_bounds_are_logged_once(point_agent):
+    def runaway(X):
+        return X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
+
     starts = torch.tensor([[0.6], [1.4], [0.8]])
     options = {"model_episodes": 3, "updates_per_model_step": 1}
-    agent = point_agent(dynamics=runaway, initial_states=lambda n: starts[:n], **options).learn(5)
+    options |= {"initial_states": lambda n: starts[:n]}
+    agent = point_agent(dynamics=PhysicsDynamics(POINT_SPEC, runaway), **options).learn(5)
     assert agent.logger.name_to_value["model/left_bounds"] == 1
     assert model_rows(agent) == 1 + 2 * 5
     assert agent._n_updates == 5 + 1 + 2 * 5
+    rows = agent.replay_buffer.model_buffer
+    left = rows.next_observations[:, 0, 0] == np.float32(1.4)
+    assert rows.timeouts[left, 0].all()
+    assert rows.rewards[left, 0] <= rows.rewards[:11, 0].min()
 
 
 def test_callbacks_of_stable_baselines(point_agent, normalised, point_env, tmp_path):
@@ -60,43 +64,35 @@ def test_callbacks_of_stable_baselines(point_agent, normalised, point_env, tmp_p
         assert (tmp_path / f"agent_{name}").exists()
 
 
-class Watch(DynaCallback):
-    def __init__(self):
-        super().__init__()
-        self.fits, self.returns = [], []
+def test_fits_are_told_and_an_error_there_learns_nothing_twice(point_agent, learnt_dynamics):
+    fits = []
 
-    def on_model_fit(self, metrics):
-        self.fits.append(metrics)
+    def note(agent, event, values):
+        if event == "fit":
+            fits.append(values)
+            if len(fits) == 3:
+                raise OSError("full")
 
-    def on_model_episodes(self, returns):
-        self.returns.append(returns)
-
-
-def test_hooks_of_the_model(point_agent, learnt_dynamics, monkeypatch):
-    watch = Watch()
     options = {"model_episodes": 3, "num_particles": 2, "refresh_model_data": False}
-    agent = point_agent(dynamics=learnt_dynamics(), **options)
-    agent.learn(10, EveryNTimesteps(5, watch))
-    assert [*watch.fits[0]] == ["fit_seconds"]
-    assert watch.fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
-    assert all(np.isfinite([*metrics.values()]).all() for metrics in watch.fits)
-    assert [len(returns) for returns in watch.returns] == [2, 1, 2, 1]
-    rewards = agent.replay_buffer.model_buffer.rewards[: 5 * 6, 0]
-    assert np.concatenate(watch.returns).sum() == pytest.approx(rewards.sum(), rel=1e-5)
-    monkeypatch.setattr(watch, "on_model_fit", {}.popitem)  # which raises an error
-    with pytest.raises(TypeError, match="popitem"):
-        agent.learn(5, watch, reset_num_timesteps=False)
+    agent = point_agent(dynamics=learnt_dynamics(), **options).learn(10, note)
+    assert [*fits[0]] == ["fit_seconds"]
+    assert fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
+    assert all(np.isfinite([*metrics.values()]).all() for metrics in fits)
+    rewards = agent.replay_buffer.model_buffer.rewards[15:30, 0]  # of the last three episodes
+    expected = pytest.approx(rewards.sum() / 3, rel=1e-5)
+    assert agent.logger.name_to_value["model/ep_rew_mean"] == expected
+    with pytest.raises(OSError, match="full"):
+        agent.learn(5, note, reset_num_timesteps=False)
     agent.learn(5, reset_num_timesteps=False)
-    assert len(watch.fits) == 2
-    assert agent.task.dynamics.num_transitions == 20  # nothing twice
+    assert agent.task.dynamics.num_transitions == 20
 
 
 @pytest.mark.slow
 def test_scores_of_trajectories_are_logged_and_change_nothing(
-    point_agent, sampled_dynamics, assert_same
+    point_agent, learnt_dynamics, assert_same
 ):
     one, other = (
-        point_agent(dynamics=sampled_dynamics(), score_horizons=horizons).learn(15, log_interval=9)
+        point_agent(dynamics=learnt_dynamics(), score_horizons=horizons).learn(15, log_interval=9)
         for horizons in ((1, 5), ())
     )
     found, without = (agent.logger.name_to_value for agent in (one, other))
@@ -104,6 +100,9 @@ def test_scores_of_trajectories_are_logged_and_change_nothing(
         f"model/{name}_{k}" for name in ("nlpd", "coverage", "energy") for k in (1, 5)
     }
     assert_same(one, other)
+    assert "DynaSAC(Point, LearnedDynamics, 3 episodes learnt, 15 steps, last " in repr(one)
+    one.task = None
+    assert repr(one) == "DynaSAC(Point, no task)"
 
 
 def test_callbacks_of_agents_are_called(point_agent, capsys):
@@ -116,10 +115,3 @@ def test_callbacks_of_agents_are_called(point_agent, capsys):
     with pytest.warns(match="rich is experimental"):
         point_agent().learn(10, [print_progress], progress_bar=True)
     assert "10/10" in capsys.readouterr().out
-
-
-def test_its_representation_says_what_it_is(point_agent):
-    last = point_agent().learn(10)
-    assert "DynaSAC(Point, PhysicsDynamics, 2 episodes learnt, 10 steps, last " in repr(last)
-    last.task = None
-    assert repr(last) == "DynaSAC(Point, no task)"

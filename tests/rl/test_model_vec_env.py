@@ -1,5 +1,6 @@
 """The model as a vectorised environment."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,20 +10,21 @@ from gymnasium import spaces
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.physics import PhysicsError
 from gpadjust.rl import MixedReplayBuffer, ModelVecEnv
-from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_start
+from gpadjust.systems import cart_pole
+from gpadjust.systems.swing_up import REAL_CART_POLE, cart_pole_start, equation_physics
+from tests.control.conftest import fails_beyond
+from tests.point import POINT_SPEC
+from tests.systems import uniform
 
 WEIGHT = torch.ones(1, requires_grad=True)
 
 
-def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics):
-    env = cart_pole()
-    starts = cart_pole_start(3)
-    given = {"initial_states": lambda n: starts[:n], "episode_length": 25}
-    task = Task(cart_pole_dynamics, cart_pole_reward, **given)
+def test_perfect_physics_are_the_real_environment():
+    system, starts = cart_pole(), cart_pole_start(3)
+    env, dynamics = system.make(), PhysicsDynamics(system.spec, equation_physics(REAL_CART_POLE))
+    task = replace(system, start=lambda n: starts[:n]).task(dynamics)
     particles = ModelVecEnv(task, 3, env.observation_space, env.action_space)
     actions = np.random.default_rng(0).uniform(-10, 10, (25, 3, 1)).astype(np.float32)
     seen = [particles.reset()]
@@ -48,22 +50,23 @@ LEARNERS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("learner", [*LEARNERS])
-@pytest.mark.parametrize("task", ["costs", "normalised costs", "survival"])
-def test_leaving_the_bounds_is_not_learnt(point_particles, learner, task):
+@pytest.mark.parametrize(("learner", "survival"), [("SAC", False), ("PPO", True)])
+def test_leaving_the_bounds_is_not_learnt(point_particles, learner, survival):
     """Neither where it would end costs, nor where it would end the danger of an early end."""
-    survival = task == "survival"
+    parts = {"reward": lambda s, a, n: -1 - n[:, 0].square()}
+    if survival:
+        parts = {
+            "reward": lambda s, a, n: 1 + 0 * n[:, 0],
+            "terminated": lambda states: states[:, 0] < -0.5,
+        }
     env = point_particles(
         num_envs=8,
-        reward=(lambda s, a, n: 1 + 0 * n[:, 0])
-        if survival
-        else (lambda s, a, n: -1 - n[:, 0].square()),
-        terminated=(lambda states: states[:, 0] < -0.5) if survival else None,
         initial_states=lambda n: 1 + torch.rand(n, 1),
         episode_length=10,
         state_bounds=torch.tensor([[-2.5], [2.5]]),
+        **parts,
     )
-    seen = VecNormalize(env, norm_obs=False) if task == "normalised costs" else env
+    seen = env if survival else VecNormalize(env, norm_obs=False)
     agent = LEARNERS[learner]("MlpPolicy", seen, policy_kwargs={"net_arch": [32]}, seed=0)
     agent.learn(8_000)
     assert env.num_left_bounds > 0
@@ -85,8 +88,7 @@ def moved(particles, *actions):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_one_call_of_the_model_moves_all_particles(point_particles, point_dynamics, dtype):
-    calls = []
-    step = point_dynamics.sample
+    calls, step = [], point_dynamics.sample
     point_dynamics.sample = lambda *args: calls.append(len(args[0])) or step(*args)
     particles = point_particles(observation_space=spaces.Box(-np.inf, np.inf, (1,), dtype))
     assert particles.reset().dtype == dtype
@@ -99,10 +101,10 @@ def test_one_call_of_the_model_moves_all_particles(point_particles, point_dynami
 
 
 @pytest.fixture
-def unsure_dynamics(point_dynamics):
+def unsure_dynamics():
     """Of the point, learnt from few transitions."""
-    dynamics = LearnedDynamics(point_dynamics.spec, point_dynamics.physics)
-    states, actions = torch.rand(4, 1).double(), torch.rand(4, 1).double()
+    dynamics = LearnedDynamics(POINT_SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:])
+    states, actions = uniform(4, 1), uniform(4, 1, seed=1)
     dynamics.update(states, actions, states + 0.4 * actions + 0.3 * (3 * states).sin())
     return dynamics
 
@@ -139,13 +141,11 @@ def test_termination_ends_an_episode(point_particles):
     *_, dones, infos = moved(particles, 1, 1, 1)  # at the time limit, too
     assert dones.all()
     assert not any(info["TimeLimit.truncated"] for info in infos)
-
-
-def test_each_particle_has_its_own_clock(point_particles, rise):
+    # Each particle has its own clock.
     end = {"terminated": lambda states: states[:, 0] > 1.9}
     particles = point_particles(num_envs=2, episode_length=3, **end)
     moved(particles, 2, 0)  # ends the first
-    ended = [particles.step(0 * rise(2))[2].tolist() for _ in range(3)]
+    ended = [particles.step(np.zeros((2, 1)))[2].tolist() for _ in range(3)]
     assert ended == [[False, False], [False, True], [True, False]]
 
 
@@ -172,45 +172,39 @@ def test_particles_that_leave_the_bounds_end_and_are_counted(point_particles):
     assert particles.task.state_bounds.tolist() == [[0.0], [5.0]]
 
 
-@pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_particles_that_leave_the_numbers_end(point_particles, point_dynamics, value):
+def test_particles_that_leave_the_numbers_end(point_particles, point_dynamics):
     def broken(states, actions):
         following = states + actions
-        following[1] = value
+        following[1] = torch.inf
+        following[2] = torch.nan
         return following
 
     point_dynamics.sample = broken
     particles = point_particles(terminated=lambda states: states[:, 0] > 10)
     obs, rewards, dones, infos = moved(particles, 1, 1, 1)
-    assert dones.tolist() == [False, True, False]
-    assert particles.num_left_bounds == 1
+    assert dones.tolist() == [False, True, True]
+    assert particles.num_left_bounds == 2
     for values in (obs, rewards, infos[1]["terminal_observation"]):
         assert np.isfinite(values).all()
 
 
-@pytest.fixture
-def choosy_dynamics(point_dynamics):
-    """The point, whose physics fails at large actions."""
-
-    def choosy(X):
-        bad = (X[:, 1] > 1.5).nonzero().flatten().tolist()
-        if bad:
-            raise PhysicsError("too fast", bad)
-        return X[:, :1] + 0.4 * X[:, 1:]
-
-    return PhysicsDynamics(point_dynamics.spec, choosy)
+CHOOSY = PhysicsDynamics(POINT_SPEC, fails_beyond(1.2))
 
 
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
-def test_particles_at_which_the_physics_fails_end(point_particles, choosy_dynamics, sampling):
-    env = point_particles(dynamics=choosy_dynamics, sampling=sampling)
-    obs, _, dones, infos = moved(env, 1, 2, 0)
+def test_particles_at_which_the_physics_fails_end(point_particles, sampling):
+    """Rows are filled up to blocks of one size, which the physics may blame."""
+    env = point_particles(dynamics=CHOOSY, sampling=sampling)
+    moved(env, 0, 1, -1)
+    obs, _, dones, infos = env.step(np.zeros((3, 1)))
     assert dones.tolist() == [False, True, False]
     assert infos[1]["left_bounds"]
-    assert obs[:, 0].tolist() == pytest.approx([1.4, 1.0, 1.0])
-    _, _, dones, infos = moved(env, 2, 2, 2)
-    assert dones.all()
-    assert all(info["left_bounds"] for info in infos)
+    assert infos[1]["terminal_observation"] == 1.5
+    assert obs[:, 0].tolist() == [1.0, 1.0, 0.5]
+    for failing in (0, 3, 6):
+        states = np.where(np.arange(7) == failing, 1.5, 1.0)[:, None]
+        left = refreshed(env, states, np.zeros((7, 1))).dones[:7, 0].astype(bool)
+        assert left.nonzero()[0].tolist() == [failing]
 
 
 # Transitions of earlier models
@@ -225,31 +219,18 @@ def refreshed(env, states, actions):
     return mixed.model_buffer
 
 
-@pytest.mark.parametrize("failing", [0, 3, 6])
-def test_functions_whose_physics_fails_at_any_row(point_particles, choosy_dynamics, failing):
-    """Rows are filled up to blocks of one size, which the physics may blame."""
-    env = point_particles(dynamics=choosy_dynamics, sampling="trajectory")
-    env.reset()
-    scaled = np.where(np.arange(7) == failing, 1.0, 0.1)[:, None]
-    left = refreshed(env, np.ones((7, 1)), scaled).dones[:7, 0].astype(bool)
-    assert left.nonzero()[0].tolist() == [failing]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
-@pytest.mark.parametrize("rows", [0, 1, 7])
-def test_refreshed_transitions_end_as_the_model_has_it(
-    point_particles, unsure_dynamics, sampling, rows
-):
+def test_refreshed_transitions_end_as_the_model_has_it(point_particles, unsure_dynamics, sampling):
     env = point_particles(dynamics=unsure_dynamics, sampling=sampling)
-    states = np.linspace(0.1, 0.9, rows, dtype=np.float32)[:, None]
+    assert refreshed(env, np.ones((0, 1)), np.ones((0, 1))).size() == 0
+    states = np.linspace(0.1, 0.9, 7, dtype=np.float32)[:, None]
     buffer = refreshed(env, states, 0.2 * states)
-    assert buffer.size() == rows
+    assert buffer.size() == 7
     pair = (torch.from_numpy(values).double() for values in (states, 0.4 * states))
     mean, variance = unsure_dynamics.predict(*pair)
-    following = torch.from_numpy(buffer.next_observations[:rows, 0])
+    following = torch.from_numpy(buffer.next_observations[:7, 0])
     assert ((following - mean).abs() <= 6 * variance.sqrt() + 1e-6).all()
-    rewards = torch.from_numpy(buffer.rewards[:rows, 0])
+    rewards = torch.from_numpy(buffer.rewards[:7, 0])
     torch.testing.assert_close(rewards, -following[:, 0].square())
 
 

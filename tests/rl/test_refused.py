@@ -12,9 +12,8 @@ from stable_baselines3 import PPO, SAC, TD3
 from gpadjust.control import EpisodeCheckpoint
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import PhysicsError
-from gpadjust.rl import Dyna, DynaCallback, DynaSAC
+from gpadjust.rl import Dyna, DynaSAC
 from tests.point import POINT_SPEC
-from tests.rl.conftest import model_rows
 
 LINE, PLANE = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (2,))
 
@@ -55,13 +54,10 @@ CALLS = [
     (lambda at: at.agent(at.env().unwrapped, episode_length=None).learn(5), "no time limit"),
     (lambda at: at.agent(use_sde=True).learn(5, at.checkpoint), "cannot resume use_sde=True"),
     (lambda at: at.sac().learn(5, at.checkpoint), "is for learners with a model"),
-    (lambda at: at.sac().learn(5, DynaCallback()), "DynaCallback is for Dyna agents.*found SAC"),
     (lambda at: at.agent().model_env(3), "initial_states"),
     (lambda at: at.agent().predict(np.array([np.nan], dtype=np.float32)), "No action can be chos"),
     (lambda at: at.particles(observation_space=PLANE), "observation has 1 entries"),
-    (lambda at: at.particles(observation_space=spaces.Discrete(2)), "observation has 1 entries"),
     (lambda at: at.particles(num_envs=0), "num_envs must be at least 1; found 0"),
-    (lambda at: at.particles(sampling="swarm"), "Unknown sampling 'swarm'"),
     (lambda at: at.particles(initial_states=None), "needs a task with initial_states"),
     (
         lambda at: stepped(at.particles(initial_states=torch.zeros)),
@@ -108,14 +104,6 @@ def test_wrong_functions_are_found_before_the_first_real_step(point_agent, parts
     assert agent.num_timesteps == 0
 
 
-def test_terminations_that_come_late_are_refused(point_agent, point_env):
-    env = point_env()
-    agent = point_agent(env).learn(5)
-    env.unwrapped.end = -9
-    with pytest.raises(ValueError, match="terminated=True, but the task has False"):
-        agent.learn(5, reset_num_timesteps=False)
-
-
 def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
     def noisy(*transition):
         return 1.05 * point_reward(*transition)
@@ -124,7 +112,3 @@ def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
         point_agent(reward=noisy).learn(5)
     for tolerance in (0.1, None):
         assert point_agent(reward=noisy, reward_tolerance=tolerance).learn(5).num_episodes == 1
-
-
-def test_a_time_limit_put_around_by_hand_is_read(point_agent):
-    assert model_rows(point_agent(episode_length=None).learn(5)) == 2 * 5

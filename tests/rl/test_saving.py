@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.dynamics import PhysicsDynamics, StateSpec
-from gpadjust.rl import DynaCallback, DynaSAC
+from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.rl import DynaSAC
+from tests.point import POINT_SPEC, robot
 
 
 def test_a_loaded_agent_predicts_the_same_and_its_dynamics_learn_all(
@@ -40,7 +41,7 @@ def test_the_file_holds_neither_physics_nor_functions_nor_environment(
     point_agent, point_env, tmp_path
 ):
     class Unpicklable:
-        """A physics, reward and so on that no pickler can take."""
+        """A function that no pickler can take."""
 
         def __init__(self, function):
             self.function, self.lock = function, threading.Lock()
@@ -48,24 +49,17 @@ def test_the_file_holds_neither_physics_nor_functions_nor_environment(
         def __call__(self, *args):
             return self.function(*args)
 
-        def __reduce__(self):
-            raise AssertionError("pickled")
-
-    env = point_env()
-    env.unwrapped.robot = threading.Lock()
-    spec = StateSpec(["x"], ["v"])
     agent = point_agent(
-        env,
-        dynamics=PhysicsDynamics(spec, Unpicklable(lambda X: X[:, :1] + 0.5 * X[:, 1:])),
+        robot(point_env()),
+        dynamics=PhysicsDynamics(POINT_SPEC, Unpicklable(lambda X: X[:, :1] + 0.5 * X[:, 1:])),
         reward=Unpicklable(lambda states, actions, next_states: -next_states[:, 0].square()),
-        terminated=Unpicklable(lambda states: states[:, 0] > 99),
         initial_states=Unpicklable(lambda n: torch.ones(n, 1)),
     )
-    agent.learn(5, DynaCallback())
+    agent.learn(5, Unpicklable(lambda agent, event, values: None))
     agent.save(tmp_path / "agent.zip")
     with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
         data = archive.read("data").decode()
-    for name in ("task", "dynamics", "env", "model_hooks"):
+    for name in ("task", "dynamics", "env", "fit_callbacks"):
         assert f'"{name}":' not in data
 
 

@@ -15,11 +15,11 @@ ARM = StateSpec(["goal", "q", "v"], ["torque"], angles=["q"], exogenous=["goal"]
 MEMORY = StateSpec(["last", "x", "goal"], ["b", "a"], exogenous=["goal"], previous={"last": "a"})
 
 
-def swing(num_steps, step=0.1, rate=2.0, goal=0.3):
+def swing(num_steps, step=0.1, rate=2.0):
     """A pendulum's states at equal times: goal, angle and its velocity."""
     t = step * torch.arange(num_steps + 1, dtype=torch.float64)
-    path = torch.stack([goal + 0 * t, 3 * (rate * t).sin(), 3 * rate * (rate * t).cos()], -1)
-    return path[:-1], path[1:]
+    path = torch.stack([0.3 + 0 * t, 3 * (rate * t).sin(), 3 * rate * (rate * t).cos()], -1)
+    return path[:-1], path[1:].clone()
 
 
 def check(spec, states, following, actions=None):
@@ -33,13 +33,12 @@ def test_observations_are_decoded(angle, position):
     spec = StateSpec(["x", "theta"], ["a"], angles=["theta"])
     state = torch.tensor([[position, angle]], dtype=torch.float64)
     seen = spec.observe(state)
-    expected = [position, math.sin(angle), math.cos(angle)]
-    torch.testing.assert_close(seen, torch.tensor([expected], dtype=torch.float64))
+    expected = torch.tensor([[position, math.sin(angle), math.cos(angle)]], dtype=torch.float64)
+    torch.testing.assert_close(seen, expected)
     decoded = spec.decode(seen)
     torch.testing.assert_close(spec.observe(decoded), seen)
     assert -math.pi <= decoded[0, 1] <= math.pi
-    change = spec.change(state, decoded)
-    torch.testing.assert_close(change, torch.zeros(1, 2).double(), rtol=0, atol=1e-9)
+    assert spec.change(state, decoded).abs().max() < 1e-9
 
 
 def test_sine_and_cosine_that_are_elsewhere_are_found():
@@ -67,7 +66,6 @@ REFUSED = [
     ({"previous": {"x": "b"}}, ValueError, r"'b', which is neither: .* actions are \('a',\)"),
     ({"previous": {"x": "v"}, "actions": ["a", "v"]}, ValueError, "'v', which is both"),
     ({"previous": {"x": "v", "v": "x"}}, ValueError, "circular, x -> v -> x"),
-    ({"previous": {"x": "v"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'v' is not"),
     ({"previous": {"x": "v"}, "angles": ["v"]}, ValueError, "'v' is one .* and 'x' is not"),
     ({"previous": {"x": "a"}, "exogenous": ["x"]}, ValueError, "'x' has two roles"),
     ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'a' is not"),
@@ -100,18 +98,16 @@ def test_an_exogenous_state_that_moves_is_named():
     states, following = swing(10)
     following[4, 0] += 0.01
     following[2] = math.nan
-    with pytest.raises(ValueError, match=r"'goal' .* 0\.31 where 0\.3 .* row 4"):
-        check(ARM, states, following)
+    refused(ValueError, r"'goal' .* 0\.31 where 0\.3 .* row 4", check, ARM, states, following)
 
 
 def test_a_wrong_step_is_found():
     for factor in (0.5, 0.8, 1.25, 2.0, -1.0):
         states, following = swing(25, step=0.1 * abs(factor))
         following[7, 1] = math.nan
-        if factor < 0:
-            states[:, 2], following[:, 2] = -states[:, 2], -following[:, 2]
-        with pytest.raises(ValueError, match=rf"step=0.1.* {factor:.2g}"):
-            check(ARM, states, following)
+        turned = math.copysign(1.0, factor) * torch.tensor([0, 0, 1]) + torch.tensor([1, 1, 0])
+        words = rf"step=0.1.* {factor:.2g}"
+        refused(ValueError, words, check, ARM, turned * states, turned * following)
 
 
 def test_the_velocity_of_another_state_is_warned_of():
@@ -149,11 +145,9 @@ def test_what_is_no_previous_action_is_named():
     following = MEMORY.complete(states, actions, states[:, 1:2])
     check(MEMORY, states, following + 1e-7 * (following == actions[:, 1:]), actions)
     following[3, 0] += 0.1
-    with pytest.raises(ValueError, match=r"'last' .*'a'.* row 3"):
-        check(MEMORY, states, following, actions)
-    scales = torch.tensor([1e4, 1.0])  # another action's does not matter
-    with pytest.raises(ValueError, match=r"'last' .* in row 3"):
-        check(MEMORY, states, following, scales * actions)
+    for scales in (torch.ones(2), torch.tensor([1e4, 1.0])):  # another action's does not matter
+        words = r"'last' .*'a'.* row 3"
+        refused(ValueError, words, check, MEMORY, states, following, scales * actions)
 
 
 # Previous states
@@ -176,11 +170,8 @@ def test_previous_values_are_those_before_the_step_in_any_order(names):
     for block, own in zip(following, ({"y": -1.0, "q": -2.0}, {"y": -3.0, "q": -4.0}), strict=True):
         assert block[0].tolist() == [{**expected, **own}[name] for name in states]
     assert [states[i] for i in spec.moving] == [states[i] for i in spec.predicted] == ["y", "q"]
-    assert {states[i] for i in spec.previous_columns} == {*LAGS}
-    variance = spec.complete_variance(torch.tensor([0.5, 0.7]))
-    assert dict(zip(states, variance.tolist(), strict=True)) == pytest.approx(
-        {**dict.fromkeys(LAGS, 0.0), "y": 0.5, "q": 0.7}
-    )
+    variance = dict(zip(states, spec.complete_variance(torch.tensor([0.5, 0.25])), strict=True))
+    assert variance == {**dict.fromkeys(LAGS, 0.0), "y": 0.5, "q": 0.25}
     gradients = torch.autograd.grad(following.sum(), (row, action))
     read = dict(zip(states, (gradients[0] / 2).tolist(), strict=True))
     assert read == {"y": 1, "y_1": 1, "y_2": 0, "u_1": 1, "u_2": 0, "q": 1, "q_1": 0}
@@ -188,9 +179,8 @@ def test_previous_values_are_those_before_the_step_in_any_order(names):
 
 
 def test_what_is_no_previous_state_is_named():
-    spec = StateSpec(
-        ["y", "y_1", "q", "q_1"], ["u"], angles=ANGLES, previous={"y_1": "y", "q_1": "q"}
-    )
+    previous = {"y_1": "y", "q_1": "q"}
+    spec = StateSpec(["y", "y_1", "q", "q_1"], ["u"], angles=ANGLES, previous=previous)
     states = 300 + uniform(5, 4)
     following = spec.complete(states, torch.zeros(1), states[:, [0, 2]] + 0.1)
     following[:, 3] += 2 * math.pi  # the same angle

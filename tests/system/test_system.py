@@ -1,6 +1,5 @@
 """A system in one object: its environment, its task, its physics with and without unknowns."""
 
-import functools
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +11,11 @@ import pytest
 import torch
 
 from gpadjust import systems
-from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.states import Sensors
 from gpadjust.systems import System
 from gpadjust.systems.swing_up import REAL_CART_POLE, believed_cart_pole, equation_physics
+from tests.point import assert_equal
 from tests.systems import normal, refused, uniform
 
 SPEC = StateSpec(["x", "v"], ["force"])
@@ -58,36 +57,36 @@ def test_the_environment_ends_where_the_system_says():
     assert env.unwrapped.mass == 2.0
     env.reset(seed=0)
     assert [env.step(np.ones(1))[3] for _ in range(3)] == [False, False, True]
-    assert not isinstance(cart().make(), gym.wrappers.TimeLimit)
+    assert isinstance(cart().make(), Cart)
 
 
 def test_the_environments_own_time_limit_may_only_be_longer():
     def pendulum(length):  # gymnasium truncates it after 200 steps
-        return System(lambda: gym.make("Pendulum-v1"), SPEC, coast, reward, episode_length=length)
+        system = System(lambda: gym.make("Pendulum-v1"), SPEC, coast, reward, episode_length=length)
+        return system.make()
 
-    env = pendulum(3).make()
-    env.reset(seed=0)
-    assert [env.step(np.ones(1, np.float32))[3] for _ in range(3)] == [False, False, True]
+    assert isinstance(pendulum(3), gym.wrappers.TimeLimit)
     for length in (None, 200):
-        assert isinstance(pendulum(length).make().env, gym.wrappers.OrderEnforcing)  # as it was
-    with pytest.raises(ValueError, match=r"at most the environment's own time limit, 200 .* 300"):
-        pendulum(300).make()
+        assert isinstance(pendulum(length).env, gym.wrappers.OrderEnforcing)  # as it was
+    refused(ValueError, r"at most the environment's own time limit, 200 .* 300", pendulum, 300)
 
 
 def test_the_task_has_what_the_system_knows():
-    bounds = torch.tensor([[-1.0, -1.0], [1.0, 1.0]], dtype=torch.float64)
-    given = {"terminated": lambda states: states[:, 0] > 1, "state_bounds": bounds}
+    given = {
+        "terminated": lambda states: states[:, 0] > 1,
+        "constraints": lambda states, actions: states[:, :1] - 1,
+        "state_bounds": torch.tensor([[-1.0, -1.0], [1.0, 1.0]], dtype=torch.float64),
+        "episode_length": 9,
+    }
     start = lambda n: torch.zeros(n, 2, dtype=torch.float64)  # noqa: E731
-    system = cart(start=start, episode_length=9, **given)
+    system = cart(start=start, physics_error={"v": 0.1}, **given)
     dynamics = PhysicsDynamics(SPEC, coast)
     task = system.task(dynamics)
-    assert isinstance(task, Task)
-    assert task.dynamics is dynamics
-    assert (task.reward, task.terminated) == (reward, given["terminated"])
-    assert (task.initial_states, task.episode_length) == (start, 9)
-    assert torch.equal(task.state_bounds, bounds)
+    assert (task.dynamics, task.reward, task.initial_states) == (dynamics, reward, start)
+    assert_equal({name: getattr(task, name) for name in given}, given)
     first, second = system.task().dynamics, system.task().dynamics
     assert isinstance(first, LearnedDynamics)
+    assert first.physics_error == {"v": 0.1}
     assert first is not second
 
 
@@ -108,28 +107,16 @@ def test_what_is_no_part_of_a_system_is_refused(parts, words):
 
 def test_the_cart_pole_is_that_of_its_id():
     ours, known = systems.cart_pole().make(), gym.make("gpadjust/CartPoleSwingUp-v0")
-    push = np.array([3.0], dtype=np.float32)
-    steps = []
+    push, steps = np.array([3.0], dtype=np.float32), []
     for env in (ours, known):
         env.reset(seed=4)
-        steps.append([env.step(push) for _ in range(25)])
-    for (seen, paid, *_), (expected, cost, *_) in zip(*steps, strict=True):
-        assert np.array_equal(seen, expected)
-        assert paid == cost
+        steps.append([env.step(push)[:4] for _ in range(25)])
+    assert_equal(*steps)
     assert steps[0][-1][3]
     assert ours.unwrapped.equation == REAL_CART_POLE
     system = systems.cart_pole(3, encode_angle=False)
     assert system.make().observation_space.shape == (4,)
     assert (system.physics.rhs, system.physics.step) == (believed_cart_pole(3), 0.1)
-
-
-def test_sensors_of_any_system_can_be_noisy():
-    make = functools.partial(System, Cart, SPEC, lambda X: X[:, :2], lambda s, a, n: n[:, 0])
-    (true, _), (seen, _) = (make(noise=n).make().reset(seed=0) for n in (None, {"v": 0.1}))
-    assert seen[0] == true[0]
-    assert 0 < abs(seen[1] - true[1]) < 0.5
-    with pytest.raises(ValueError, match="no state 'y'"):
-        make(noise={"y": 0.1}).make()
 
 
 def test_an_environment_shows_the_states_or_what_is_measured_of_them():
@@ -145,8 +132,12 @@ def test_an_environment_shows_the_states_or_what_is_measured_of_them():
     assert isinstance(blind.make(), Blind)
     assert cart(**only).make().reset(seed=0)[0].shape == (1,)
     for parts in ({"noise": {"x": 0.1}}, {"sensors": Sensors(["x", "v", "sum"], lambda s: s)}):
-        with pytest.raises(ValueError, match=r"must observe the states .2 entries.*found Box"):
-            replace(blind, **parts).make()
+        words = r"must observe the states .2 entries.*found Box"
+        refused(ValueError, words, replace(blind, **parts).make)
+    both = Sensors(["both"], lambda states: 3 + states.sum(-1, keepdim=True))
+    assert replace(blind, env=Cart, sensors=both).make().reset(seed=0)[0].tolist() == [3.0]
+    words = r"no output 'x'; the outputs are \('both',\)"
+    refused(ValueError, words, replace(blind, env=Cart, sensors=both, noise={"x": 1.0}).make)
 
 
 def test_no_system_hides_a_module():
@@ -183,7 +174,6 @@ def test_its_parameters_are_found_by_least_squares():
     assert {n: found[n].median().item() for n in found} == pytest.approx(truth, rel=1e-4)
 
 
-@pytest.mark.slow
 def test_noise_of_sensors_has_its_size_and_leaves_rewards_alone():
     noise = {"theta": 0.1, "x_dot": 0.5}
     seen, true = systems.cart_pole(noise=noise).make(), systems.cart_pole().make()
@@ -200,3 +190,4 @@ def test_noise_of_sensors_has_its_size_and_leaves_rewards_alone():
             errors.append(spec.change(torch.from_numpy(true.unwrapped.state), state))
     sd = torch.stack(errors).std(0)
     torch.testing.assert_close(sd, torch.tensor([0, 0.1, 0.5, 0]).double(), rtol=0.1, atol=1e-5)
+    refused(ValueError, "no state 'y'", cart(noise={"y": 0.1}).make)
