@@ -83,7 +83,7 @@ def test_intervals_cover_the_parameters_of_sensor_and_spring():
     covered = []
     for seed in range(20):
         records, true = late_log(seed)
-        found = identify(records, spring(), start=START, sensors=SENSORS, num_starts=4)
+        found = identify(records, spring(), start=START, sensors=SENSORS)
         low, high = found.parameters.interval()
         covered.append(((low <= torch.tensor(true)) & (torch.tensor(true) <= high)).tolist())
         gain = float(found.parameters["x_gain"].mean())
