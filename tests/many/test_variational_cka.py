@@ -6,11 +6,9 @@ from functools import cache
 
 import pytest
 import torch
-from botorch.acquisition import UpperConfidenceBound
 from botorch.acquisition.knowledge_gradient import qKnowledgeGradient
 from botorch.acquisition.logei import qLogNoisyExpectedImprovement
 from botorch.acquisition.thompson_sampling import PathwiseThompsonSampling
-from botorch.models import ModelListGP
 from botorch.models.transforms import Normalize
 from botorch.optim import optimize_acqf
 
@@ -132,18 +130,14 @@ def test_later_rows_are_observed_exactly(model, close, has_rest):
     torch.testing.assert_close(draws.std(0), later.predict(Z).variance.sqrt(), rtol=0.3, atol=0)
     fantasies = model.condition_on_observations(X, torch.stack([Y, Y + 1, Y - 1]))
     close(fantasies.predict(Z).mean[0], later.predict(Z).mean, 1e-6)
-    refused(NotImplementedError, "Build a model of all data", later.left_out)
 
 
-def test_shapes_and_gradients(model, close, gradient_is_right):
+def test_shapes_of_batches(model, close):
     m, X = model.num_outputs, problem(24)[0].reshape(2, 3, 4, 1)
     posterior = model.posterior(X)
     assert posterior.rsample(torch.Size([5])).shape == (5, 2, 3, 4, m)
     close(posterior.mean[1, 2], model.posterior(X[1, 2]).mean)
-    last = model.posterior(X, output_indices=[m - 1])
-    close(last.mean, posterior.mean[..., -1:])
-    gradient_is_right(lambda X: model.predict(X).mean.sum(), X[0, 0])
-    gradient_is_right(lambda X: model.posterior(X).variance.sum(), X[0, 0])
+    close(model.posterior(X, output_indices=[m - 1]).mean, posterior.mean[..., -1:])
 
 
 @pytest.mark.slow
@@ -151,18 +145,12 @@ def test_botorch():
     X, Y = problem(60)
     model = at_random(make(X, Y))
     options = {"num_restarts": 1, "raw_samples": 4, "options": {"maxiter": 3}}
-    functions = (
-        UpperConfidenceBound(model, 0.2),
-        qLogNoisyExpectedImprovement(model, X[:10]),
-        qKnowledgeGradient(model, num_fantasies=2),
-    )
-    for acquisition in functions:
-        best, _ = optimize_acqf(acquisition, torch.tensor([[0.0], [1.0]]).double(), q=1, **options)
+    box = torch.tensor([[0.0], [1.0]]).double()
+    for function in (qLogNoisyExpectedImprovement(model, X[:10]), qKnowledgeGradient(model, 2)):
+        best, _ = optimize_acqf(function, box, q=1, **options)
         assert best.isfinite().all()
     value = PathwiseThompsonSampling(model)(torch.tensor([0.28, 0.75]).double().reshape(2, 1, 1))
     assert value[0] > value[1]
-    both = ModelListGP(model, exact_of(model))
-    assert both.posterior(X[:3]).mean.shape == (3, 2)
     names = {"many": model, "exact": exact_of(model)}
     assert StackedGP.by_left_out(names, 8).predict(X[:3]).mean.isfinite().all()
 
@@ -173,14 +161,12 @@ def test_copies_states_and_outputs(model):
     fresh = make(*model.data[:2])
     fresh.inducing = 0 * fresh.inducing
     fresh.load_state_dict(model.state_dict())
-    copies = [copy.deepcopy(model), pickle.loads(pickle.dumps(model)), fresh, model.to("cpu")]
-    for each in copies:
+    for each in (pickle.loads(pickle.dumps(model)), fresh, model.to("cpu")):
         same(each.predict(Z, True), before, rtol=1e-10, atol=0)
         assert each.summary() == model.summary()
     assert "varies in 0 of 1 draws" in make(*problem(10)).summary()
-    for kept in ([0], [-1], [model.num_outputs - 1, 0][: model.num_outputs]):
-        part = model.subset_output(kept)
-        same(part.predict(Z, True), [v[:, kept] for v in before], rtol=1e-6, atol=0)
+    part = model.subset_output([-1])
+    same(part.predict(Z, True), [v[:, [-1]] for v in before], rtol=1e-6, atol=0)
 
 
 def test_a_file_has_inducing_points_and_later_rows(tmp_path):
@@ -220,7 +206,7 @@ def test_inducing_points_are_pivots():
 @pytest.mark.slow
 def test_noise_is_no_function_and_a_function_is_found():
     X = line(400)
-    for seed in range(3):
+    for seed in range(2):
         Y = torch.cat([0.1 * normal(400, 1, seed=seed), 0.1 * normal(400, 1, seed=seed + 9)], -1)
         Y[:, 1:] += 0.3 * (40 * X).sin()
         Y[::5, 1] = torch.nan
@@ -312,23 +298,20 @@ def test_an_error_leaves_the_model_as_it_was(monkeypatch, error):
     assert all(map(torch.equal, model.predict(line(4)), prediction))
 
 
-SLOW = [pytest.param(case, marks=pytest.mark.slow) for case in ("repeated", "constant")]
-
-
-@pytest.mark.parametrize("case", [*SLOW, "all the same", "few rows"])
+@pytest.mark.parametrize(
+    "case", [pytest.param("repeated", marks=pytest.mark.slow), "constant", "few rows"]
+)
 def test_inputs_that_repeat_or_rest(case):
     X, Y = problem(60)
     inputs = {
         "repeated": torch.cat([X[:30], X[:30]]),
-        "constant": torch.cat([X, torch.ones_like(X)], dim=-1),
-        "all the same": torch.full_like(X, 0.3),
+        "constant": torch.cat([X[:30], torch.ones_like(X[:30])], dim=-1),
         "few rows": X[:4],
     }[case]
     Y = torch.cat([Y[:30], Y[:30] + 0.1]) if case == "repeated" else Y[: len(inputs)]
     model = make(inputs, Y)
     assert fit(model).log_evidence.isfinite().all()
-    error = (model.predict(inputs).mean - Y).std()
-    assert error < (2.0 if case == "all the same" else 0.2)
+    assert (model.predict(inputs).mean - Y).std() < 0.2
 
 
 class LinkedMany(Linked, VariationalCKA):
@@ -341,30 +324,27 @@ def test_links_and_categories():
     model = LinkedMany(X, Y.exp(), physics=lambda X: wave(X).exp(), link="log", num_inducing=12)
     fit(model)
     lower, upper = model.interval(line(50))
-    assert (lower > 0).all()
     f = truth(line(50))[..., :1].exp()
     assert ((lower < f) & (f < upper)).double().mean() > 0.8
     assert ((model.predict(line(50)).mean / f).log().std()) < 0.1
     assert model.left_out().prediction.mean.isfinite().all()
-    pandas = pytest.importorskip("pandas")
-    frame = pandas.DataFrame({"x": X[:, 0], "material": ["iron", "tin"] * 40})
-    Y = Y + torch.tensor([[0.0], [1.0]]).repeat(40, 1)
-    for transform in (Categories(["material"]), Categories([], batches=["material"])):
-        model = VariationalCKA(frame, Y, physics=wave, input_transform=transform, num_inducing=20)
-        fit(model)
-        assert (model.predict(frame).mean.to_numpy() - Y.numpy()).std() < 0.15
+    inputs = torch.cat([X, torch.arange(80).remainder(2).unsqueeze(-1)], -1)
+    Y = Y + inputs[:, 1:]
+    transform = Categories([], batches=[1])
+    model = VariationalCKA(inputs, Y, physics=wave, input_transform=transform, num_inducing=20)
+    fit(model)
+    assert (model.predict(inputs).mean - Y).std() < 0.15
 
 
 REFUSED = [
-    (lambda X, Y: make(X.float(), Y.float()), TypeError, "float64"),
     (lambda X, Y: make(X, Y, num_inducing=0), ValueError, "num_inducing"),
-    (lambda X, Y: make(X, Y, num_inducing=2.5), TypeError, "num_inducing"),
     (lambda X, Y: make(X, Y, noise=HeavyTails()), ValueError, "CKA takes it"),
     (lambda X, Y: make(X, Y, nested=True), TypeError, "nested"),
     (lambda X, Y: fit(make(X, Y), num_draws=8), ValueError, "num_draws=None"),
     (lambda X, Y: make(X, Y).as_single_task_gp(), NotImplementedError, "subset_rows"),
-    (lambda X, Y: make(X, Y).term("season", X), ValueError, "Unknown term 'season'"),
-]
+    (lambda X, Y: make(X, Y).condition_on_observations(X, Y).left_out(), NotImplementedError,
+     "Build a model of all data"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("call", "error", "words"), REFUSED)
