@@ -5,7 +5,6 @@ import copy
 import pytest
 import torch
 from botorch.models.transforms import Normalize
-from botorch.sampling.pathwise import draw_matheron_paths
 
 from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, Stationary, ZeroMeanGP
 from gpadjust.physics import FunctionPhysics, Unknown
@@ -72,16 +71,6 @@ def test_shapes_and_seeds(data, drawn, uniform):
     model.set_draws(torch.zeros_like(model.u))
     assert torch.equal(functions(Z), values)
     assert torch.equal(copy.deepcopy(functions)(Z), values)
-
-
-def test_paths_of_botorch(data, drawn, uniform):
-    X, Y = data()
-    model = drawn(CKA(X, Y, physics=lambda X: crude(X)[..., :1]))
-    Z = uniform(5, 2)
-    assert draw_matheron_paths(model, torch.Size([4]))(Z).shape == (4, 5)
-    values, posterior = draw_matheron_paths(model, torch.Size([600]))(Z), model.posterior(Z)
-    error = values.mean(0) - posterior.mean.squeeze(-1)
-    assert (error.abs() < 0.15 * posterior.variance.sqrt().squeeze(-1)).all()
 
 
 def test_each_function_is_evaluated_at_its_own_points_only(data, uniform):

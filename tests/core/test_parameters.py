@@ -38,30 +38,19 @@ def beam(X, p):
     return 10 * X[:, 0] * (X[:, 1] ** 3 / (3 * p.EI) + X[:, 1] ** 2 / p.kr)
 
 
-def enzyme(X, p):
-    return p.V * X[:, 0] / (p.K + X[:, 0])
-
-
 def growth(X, p):
     return p.K / (1 + (p.K / 0.2 - 1) * torch.exp(-p.r * X[:, 0]))
-
-
-def drag(X, p):
-    limit = torch.sqrt(9.81 * p.m / p.c)
-    return limit * torch.tanh(9.81 * X[:, 0] / limit)
 
 
 # A formula, guesses and factors of its parameters, the box of the inputs, points, sd of the noise.
 PROBLEMS = {
     "beam": (beam, {"EI": (8.0, 1.6), "kr": (25.0, 1.6)}, [[0.3, 0.8], [1.0, 1.1]], 14, 0.01),
-    "enzyme": (enzyme, {"V": (3.0, 2.0), "K": (2.0, 2.0)}, [[0.1], [1.5]], 12, 0.02),
     "growth": (growth, {"r": (1.0, 1.4), "K": (5.0, 2.0)}, [[0.0], [3.5]], 13, 0.03),
-    "drag": (drag, {"m": (80.0, 1.3), "c": (0.4, 1.8)}, [[0.5], [6.0]], 12, 0.5),
 }
 
 
 def case(name, seed):
-    """Inputs, targets, physics and true parameters, which are drawn from the prior."""
+    """Inputs, targets and physics, with true parameters that are drawn from the prior."""
     law, priors, box, n, noise = PROBLEMS[name]
     generator = torch.Generator().manual_seed(77_000 + seed)
     options = {"generator": generator, "dtype": torch.float64}
@@ -70,7 +59,7 @@ def case(name, seed):
     unknowns = {key: Unknown(guess, factor=factor) for key, (guess, factor) in priors.items()}
     physics = FunctionPhysics(law, unknowns=unknowns)
     true = physics.unknowns.to_values(torch.randn(2, **options))
-    return X, physics(X, true) + noise * torch.randn(n, 1, **options), physics, true
+    return X, physics(X, true) + noise * torch.randn(n, 1, **options), physics
 
 
 def by_grid(X, Y, physics, variance):
@@ -92,8 +81,8 @@ def by_grid(X, Y, physics, variance):
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_intervals_are_those_of_a_grid(name):
     variance, ratios, away = PROBLEMS[name][-1] ** 2, [], []
-    for seed in range(2):
-        X, Y, physics, _ = case(name, seed)
+    for seed in range(3):
+        X, Y, physics = case(name, seed)
         model = CalibratedPhysics(X, Y, variance, physics=physics)
         fit(model)
         found = torch.stack(model.physics_parameters.interval())
@@ -103,19 +92,6 @@ def test_intervals_are_those_of_a_grid(name):
         away.append((found - exact).abs() / width)
     assert 0.9 < torch.stack(ratios).log().mean().exp() < 1.15
     assert torch.stack(away).mean() < 0.12
-
-
-@pytest.mark.slow
-def test_intervals_cover_the_true_parameters():
-    covered = []
-    for name in PROBLEMS:
-        for seed in range(8):
-            X, Y, physics, true = case(name, seed)
-            model = CalibratedPhysics(X, Y, physics=physics)
-            fit(model)
-            low, high = model.physics_parameters.interval()
-            covered.append((low <= true) & (true <= high))
-    assert 0.9 <= torch.stack(covered).double().mean() <= 0.99
 
 
 @pytest.mark.slow

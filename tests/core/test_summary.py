@@ -10,8 +10,7 @@ from gpytorch.kernels import PeriodicKernel, RBFKernel, ScaleKernel
 from gpytorch.priors import LogNormalPrior
 
 from gpadjust import core
-from gpadjust.core import CKA, GP, Kernel, LogNormal, Noise, Stationary, Term, ZeroMeanGP
-from gpadjust.kinds import Vanishing
+from gpadjust.core import CKA, GP, LogNormal, Noise, Stationary, Term, ZeroMeanGP
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.core.noises import Relative
 from tests.systems import line, wave
@@ -101,41 +100,6 @@ def test_of_physics_kernels_and_transforms():
     assert numbers["kernels.1.period_length"].startswith(three(period))
     assert "kernels.0.base_kernel.lengthscale after the transform" in numbers
     assert "lengthscale of x2 after the transform" in numbers
-
-
-class Bump(Kernel):
-    """A kernel of a parameter in the targets' unit squared, one in the unit, and one without."""
-
-    def rows(self, x, num_outputs):
-        one = x.new_ones(num_outputs, 1)
-        return [core.Row.positive(name, one, 2.0) for name in ("outputscale", "height", "power")]
-
-    def covariance(self, own, x, other=None):
-        s, height, power = (own[name].unsqueeze(-1) for name in ("outputscale", "height", "power"))
-        distance = (x - (x if other is None else other).mT).square()
-        return (s + height.square()) * (-power * distance).exp()
-
-    def in_user_units(self, name, numbers, unit):
-        if name == "height":
-            return "height in the user's units", numbers * unit
-        return super().in_user_units(name, numbers, unit)
-
-
-@pytest.mark.parametrize("kernel", [Bump(), Vanishing({0: 0.0}, Bump())])
-def test_of_a_kernel_with_units_of_its_own(kernel):
-    one = X[:, :1]
-    model = GP(one, Y[:, :1], terms=[Term("f", kernel), Term("g", Bump(), 1.0, physics=0)],
-               physics=[lambda X: 40 * X.sin()])  # fmt: skip
-    unit = model.unit.squeeze()
-    assert unit != 1
-    text = model.summary()
-    for start, size in (("  f: ", unit), ("  g: ", torch.ones(()))):  # a scaling has no unit
-        names = ("standard deviation", "height in the user's units", "power")
-        expected = zip(names, (size, size, torch.ones(())), strict=True)
-        rows = [f"    {name}: {three(value)}" for name, value in expected]
-        assert text[text.index(start) :].splitlines()[1:4] == rows
-    rows = table(model)
-    assert rows.loc["f height in the user's units", "median"] == pytest.approx(float(unit))
 
 
 class OfPhysics(Relative):

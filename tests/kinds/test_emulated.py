@@ -20,19 +20,8 @@ def wave(X):
     return torch.sin(3 * X[:, :1]) * X[:, :1]
 
 
-def truth(X):
-    return 1.3 * wave(X) + 0.3 * X
-
-
 def simulated(x, w):
     return torch.sin(w * x) * x + 0.2 * w
-
-
-@pytest.fixture(scope="module")
-def crude():
-    """Runs in the left half, so that little is known in the right one."""
-    runs = 1.2 * line(9)
-    return EmulatedPhysics(runs, wave(runs), fit_options={"num_draws": 16}, name="crude")
 
 
 def functions(physics, X, number=4000, seed=0):
@@ -63,27 +52,6 @@ def test_several_outputs_have_errors_of_their_own_size():
     sd = physics.emulator.predict(FAR[:1]).variance[0].sqrt()
     torch.testing.assert_close(values.std(0), sd, rtol=0.1, atol=0.0)
     assert abs(values.T.corrcoef()[0, 1]) < 0.2
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Predictions depend on the seed")
-def test_intervals_are_wide_where_there_are_no_runs_and_measurements_correct_the_emulator(crude):
-    near = 1.2 * line(6)
-    certain = lambda X: crude.emulator.predict(X).mean  # noqa: E731
-    models = [PhysicsMeanGP(near, truth(near), physics=physics) for physics in (crude, certain)]
-    for model in models:
-        fit(model, num_draws=16)
-    wide, narrow = (m.predict(FAR).variance.sqrt() for m in models)
-    assert (wide > 0.3 * crude.emulator.predict(FAR).variance.sqrt()).all()
-    assert (wide > 1.2 * narrow).all()
-    X = 2.4 * line(9)
-    corrected = PhysicsMeanGP(X, wave(X), physics=crude)
-    fit(corrected, num_draws=16)
-    # What was measured is known of the simulator, too.
-    z = torch.stack([corrected.physics_parameters[f"emulator_{k + 1}"] for k in range(8)], -1)
-    away = (crude(X[5:], z) - wave(X[5:])).square().mean().sqrt()
-    before = (functions(crude, X[5:]) - wave(X[5:])).square().mean().sqrt()
-    assert away < 0.5 * before
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import torch
 from torch.distributions import MultivariateNormal
 from torch.nn.functional import silu
 
-from gpadjust.core import CKA, ZeroMeanGP, fit, load, save
+from gpadjust.core import CKA, fit, load, save
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.relative import RelativeNoise
 from gpadjust.physics import FunctionPhysics, Unknown
@@ -116,18 +116,6 @@ def test_outputs_have_outliers_of_their_own(is_shared):
     assert [rows_of(mask) for mask in model.noise.is_outlier.mT] == [ROWS, [17]]
     part = model.subset_output([1, 0])
     torch.testing.assert_close(part.noise.outliers(part), model.noise.outliers(model)[:, [1, 0]])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("base", [None, RelativeNoise()])
-def test_a_second_fit_is_the_first(base):
-    model = ZeroMeanGP(X, gross() + 2, noise=HeavyTails(base=base))
-    fit(model, "map")
-    first, added = model.predict(Z, True).variance, model.noise.added
-    assert {*ROWS} <= {*rows_of(model.noise.is_outlier)}
-    fit(model, "map")
-    assert torch.equal(model.predict(Z, True).variance, first)
-    assert torch.equal(model.noise.added, added)
 
 
 def test_a_file_has_the_share(tmp_path):

@@ -8,7 +8,6 @@ from torch.nn.functional import silu
 from gpadjust.core import CKA, GP, CalibratedPhysics, Term, fit, load, save
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.noisy_inputs import NoisyInputs
-from gpadjust.kinds.relative import RelativeNoise
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, Unknown
 from tests.systems import line, normal, refused, uniform
 
@@ -64,22 +63,6 @@ def test_moments_are_those_of_the_function_at_the_true_inputs():
 
 
 @pytest.mark.slow
-def test_it_is_nearer_than_what_ignores_it():
-    """Of Forrester's function, which is steep."""
-    steep = lambda X: (6 * X - 2).square() * torch.sin(12 * X - 4)  # noqa: E731
-    half = lambda X: 0.5 * steep(X) + 10 * (X - 0.5) - 5  # noqa: E731
-    ratios = []
-    for seed in range(2):
-        X, Y = case(seed, steep)
-        off = []
-        for model in (CKA(X, Y, physics=half), model_of(X, Y, SD**2, physics=half)):
-            fit(model, "map")
-            off.append((model.predict(TEST).mean - steep(TEST)).square().mean().sqrt().log())
-        ratios.append(off[1] - off[0])
-    assert sum(ratios) / 2 < -0.2
-
-
-@pytest.mark.slow
 def test_an_unknown_parameter_is_nearer_to_the_truth():
     true = uniform(200, 1)
     X, Y = true + 0.1 * normal(200, 1, seed=1), 2 * (true - 0.5) + 0.02 * normal(200, 1, seed=2)
@@ -121,16 +104,6 @@ def test_outliers_of_noisy_inputs(is_inner, tmp_path):
     torch.testing.assert_close(load(tmp_path / "model.pt", trusted=True).predict(TEST, True), first)
     fit(model, "map")
     assert torch.equal(model.predict(TEST).mean, first.mean)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [{"train_Yvar": 0.02**2}, {"base": RelativeNoise()}])
-def test_other_noise_of_the_targets(options):
-    model = model_of(X, Y, SD**2, physics=f_p, **options)
-    fit(model, "map")
-    assert (model.predict(TEST).mean - truth(TEST)).square().mean().sqrt() < 0.15
-    added = (model.left_out().variances[0] > model.predict(model.data.X, True).variance).sum()
-    assert added > 20
 
 
 def test_a_black_box_that_cannot_be_asked_everywhere():

@@ -1,13 +1,10 @@
 """Noise that grows with the size of what is measured."""
 
-import math
-
 import pytest
 import torch
 
-from gpadjust.core import CKA, GP, PhysicsMeanGP, Term, ZeroMeanGP, fit, load, save
+from gpadjust.core import CKA, GP, Term, ZeroMeanGP, fit, load, save
 from gpadjust.kinds.relative import RelativeNoise
-from gpadjust.physics import FunctionPhysics, Unknown
 from tests.systems import drawn, line, normal, refused
 
 X = line(40, 0.02)
@@ -71,20 +68,6 @@ def test_without_physics_sizes_are_those_of_the_posterior_mean(tmp_path):
     torch.testing.assert_close(noise_at(load(tmp_path / "model.pt"), ENDS), first)
     fit(model, "map")
     assert torch.equal(noise_at(model, ENDS), first)
-
-
-@pytest.mark.slow
-def test_unknown_parameters_are_found():
-    law = FunctionPhysics(
-        lambda X, p: (p.rate * X[:, 0] - 4).exp(), unknowns={"rate": Unknown(5.0, sd=1.0)}
-    )
-    Y = growing(0.05, 1e-3) / (1 + 0.2 * X)
-    model = PhysicsMeanGP(X, Y, physics=law, noise=RelativeNoise())
-    fit(model, num_draws=16)
-    low, high = model.physics_parameters.interval()
-    assert low[0] < 6 < high[0]
-    _, relative = model.noise.standard_deviations(model)
-    assert math.isclose(relative.median(), 0.05, rel_tol=0.5)
 
 
 class Logarithm(GP):

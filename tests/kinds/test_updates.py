@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust.core import CKA, RRA, PhysicsMeanGP, fit
+from gpadjust.core import CKA, RRA, PhysicsMeanGP
 from gpadjust.kinds.categories import Categories
 from gpadjust.kinds.links import LinkedCKA
 from gpadjust.kinds.updates import Kalman, Window, design
@@ -84,21 +84,6 @@ def test_with_forgetting_it_is_a_regression_whose_noise_grows_with_age():
     torch.testing.assert_close(kalman.weights.mean, mean, rtol=1e-7, atol=1e-7)
     found = kalman.weights.root @ kalman.weights.root.mT
     torch.testing.assert_close(found, torch.linalg.inv(precision), rtol=1e-7, atol=1e-9)
-
-
-def test_what_is_long_ago_fades_to_the_prior():
-    """Of many observations of one point the last few are left, and of no other."""
-    model, x, tau = rra(), torch.full((50, 1), 0.5, dtype=torch.float64), 10
-    kalman, values = Kalman(model, forget=tau), model.values
-    for _ in range(10):
-        kalman.update(x, wave(x))
-    rho = model.term_sum.term("rho", values, model.places(AT, values, f=()))
-    one, phi = design(model.evaluate(x[:1], values)), design(rho)
-    weight = 1 / (1 - math.exp(-1 / tau)) / model.conditioning().noise[..., :1]
-    lost = (phi @ one.mT).squeeze(-1).square() / (1 / weight + one.square().sum(-1))
-    expected = phi.square().sum(-1) - lost
-    torch.testing.assert_close(kalman.weights.moments(rho)[1], expected, rtol=1e-5, atol=1e-7)
-    assert (kalman.predict(x[:1]).mean - wave(x[:1])).abs() < 0.1
 
 
 @pytest.mark.parametrize("build", [CKA, PhysicsMeanGP])
@@ -182,19 +167,3 @@ REFUSED = [
 @pytest.mark.parametrize(("call", "error", "words"), REFUSED)
 def test_bad_input(call, error, words):
     refused(error, words, call)
-
-
-@pytest.mark.slow
-def test_a_drift_is_followed_by_both_at_a_constant_size():
-    model = RRA(X, Y, physics=wave, num_features=20)
-    fit(model, "map")
-    both = Kalman(model, forget=30), Window(model, 30)
-    for i in range(300):
-        x = uniform(1, 1, seed=i)
-        for each in both:
-            each.update(x, (2 + i / 300) * wave(x) + x)
-    for each in both:
-        assert (each.predict(X).mean - 3 * wave(X) - X).abs().max() < 0.2
-        low, high = each.interval(X, observation_noise=True)
-        assert ((low < 3 * wave(X) + X) & (3 * wave(X) + X < high)).double().mean() > 0.8
-        assert len(each.data.X) == (12 if each is both[0] else 30)

@@ -7,10 +7,10 @@ import torch
 from botorch.models.transforms import Normalize
 from gpytorch.kernels import MaternKernel, ScaleKernel
 
-from gpadjust.core import CKA, MATERN52, PhysicsMeanGP, Stationary, fit
+from gpadjust.core import CKA, MATERN52, PhysicsMeanGP, Stationary
 from gpadjust.kinds.categories import Categories
 from gpadjust.kinds.vanishing import Vanishing
-from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
+from gpadjust.physics import FormulaPhysics
 from tests.systems import drawn, normal, refused, slopes, uniform
 
 OPEN = Vanishing({"valve": 1.0})
@@ -18,9 +18,6 @@ X = uniform(16, 2, low=0.2)
 Y = 2 * X[:, 1:] ** 2 + 0.5 * (1 / X[:, :1] - 1) * X[:, 1:] ** 2 + 0.01 * normal(16, 1, seed=3)
 FRAME = pd.DataFrame(X.numpy(), columns=["valve", "flow"])
 AT_OPEN = torch.cat([torch.ones(7, 1).double(), uniform(7, 1)], -1)
-PIPE = FunctionPhysics(
-    lambda X, p: p.friction * X[:, 1] ** 2, unknowns={"friction": Unknown(1.0, factor=2.0)}
-)
 SQUARE = FormulaPhysics("flow**2", ["valve", "flow"])
 
 
@@ -87,18 +84,6 @@ def test_delta_and_rho_are_right_there():
     plain = CKA(FRAME, Y, physics=SQUARE)
     for name in ("rho.kernel.outputscale", "delta.kernel.outputscale"):
         same(both.table.values(0 * both.u[:1])[name], plain.table.values(0 * plain.u)[name])
-
-
-@pytest.mark.slow
-def test_unknown_parameters_are_those_of_the_place():
-    model = PhysicsMeanGP(FRAME, Y, physics=PIPE, covar_module=OPEN)
-    fit(model, num_draws=16)
-    lower, upper = model.physics_parameters.interval()
-    assert lower < 2 < upper
-    assert upper - lower < 0.8
-    assert model.delta(AT_OPEN).variance.max() < 1e-9
-    more = model.condition_on_observations(AT_OPEN[:2], 2 * AT_OPEN[:2, 1:] ** 2)
-    assert more.delta(AT_OPEN).variance.max() < 1e-9
 
 
 def test_transforms_and_categories():

@@ -6,14 +6,9 @@ from functools import cache
 
 import pytest
 import torch
-from botorch.acquisition.knowledge_gradient import qKnowledgeGradient
-from botorch.acquisition.logei import qLogNoisyExpectedImprovement
-from botorch.acquisition.thompson_sampling import PathwiseThompsonSampling
 from botorch.models.transforms import Normalize
-from botorch.optim import optimize_acqf
 
-from gpadjust.core import StackedGP, fit, load, save
-from gpadjust.kinds.categories import Categories
+from gpadjust.core import fit, load, save
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.links import Linked
 from gpadjust.many import VariationalCKA
@@ -140,21 +135,6 @@ def test_shapes_of_batches(model, close):
     close(model.posterior(X, output_indices=[m - 1]).mean, posterior.mean[..., -1:])
 
 
-@pytest.mark.slow
-def test_botorch():
-    X, Y = problem(60)
-    model = at_random(make(X, Y))
-    options = {"num_restarts": 1, "raw_samples": 4, "options": {"maxiter": 3}}
-    box = torch.tensor([[0.0], [1.0]]).double()
-    for function in (qLogNoisyExpectedImprovement(model, X[:10]), qKnowledgeGradient(model, 2)):
-        best, _ = optimize_acqf(function, box, q=1, **options)
-        assert best.isfinite().all()
-    value = PathwiseThompsonSampling(model)(torch.tensor([0.28, 0.75]).double().reshape(2, 1, 1))
-    assert value[0] > value[1]
-    names = {"many": model, "exact": exact_of(model)}
-    assert StackedGP.by_left_out(names, 8).predict(X[:3]).mean.isfinite().all()
-
-
 def test_copies_states_and_outputs(model):
     model.inducing = model.points(model.u.detach(), 10)  # of each output
     Z, before = line(5), with_rest(model).predict(line(5), True)
@@ -265,7 +245,7 @@ def test_what_few_points_cannot_show_is_in_the_intervals():
 
 
 @pytest.mark.slow
-def test_unknown_parameters_and_several_physics(close):
+def test_unknown_parameters():
     X, Y = problem(120)
     law = FunctionPhysics(
         lambda X, p: (p.w * X[..., 0]).sin().unsqueeze(-1), unknowns={"w": Unknown(5.0, sd=1.0)}
@@ -275,23 +255,17 @@ def test_unknown_parameters_and_several_physics(close):
     assert float(model.physics_parameters["w"][0]) == pytest.approx(6.0, abs=0.2)
     f = truth(X)[..., :1]
     assert (model.predict(X).mean - f).std() < 0.05
-    model = make(X, Y, physics={"a": wave, "b": lambda X: X.square()})
-    fit(model)
-    assert (model.predict(X).mean - f).std() < 0.05
-    parts = model.term("rho_a", X).mean * wave(X) + model.term("rho_b", X).mean * X.square()
-    close(parts + model.delta(X).mean, model.predict(X).mean, 1e-6)
 
 
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_an_error_leaves_the_model_as_it_was(monkeypatch, error):
+def test_an_error_leaves_the_model_as_it_was(monkeypatch):
     model = at_random(make(*problem(30)))
     before, prediction = copy.deepcopy(model.state_dict()), model.predict(line(4))
 
     def fail(*args):
-        raise error
+        raise KeyboardInterrupt
 
     monkeypatch.setattr("gpadjust.many.variational_cka.rest_of", fail)
-    with pytest.raises(error):
+    with pytest.raises(KeyboardInterrupt):
         fit(model, seed=1)
     for name, tensor in model.state_dict().items():
         assert torch.equal(tensor, before[name])
@@ -319,7 +293,7 @@ class LinkedMany(Linked, VariationalCKA):
 
 
 @pytest.mark.slow
-def test_links_and_categories():
+def test_a_link():
     X, Y = problem(80)
     model = LinkedMany(X, Y.exp(), physics=lambda X: wave(X).exp(), link="log", num_inducing=12)
     fit(model)
@@ -328,12 +302,6 @@ def test_links_and_categories():
     assert ((lower < f) & (f < upper)).double().mean() > 0.8
     assert ((model.predict(line(50)).mean / f).log().std()) < 0.1
     assert model.left_out().prediction.mean.isfinite().all()
-    inputs = torch.cat([X, torch.arange(80).remainder(2).unsqueeze(-1)], -1)
-    Y = Y + inputs[:, 1:]
-    transform = Categories([], batches=[1])
-    model = VariationalCKA(inputs, Y, physics=wave, input_transform=transform, num_inducing=20)
-    fit(model)
-    assert (model.predict(inputs).mean - Y).std() < 0.15
 
 
 REFUSED = [
