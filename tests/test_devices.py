@@ -18,7 +18,6 @@ ALLOWED = {
         "core/fitting.py _evenly",
         "core/fitting.py modes",
         "core/functions.py __init__",
-        "core/model.py as_single_task_gp",
         "core/model.py log_likelihood",
         "core/nuts.py proposed",
         "physics/formula.py _parsed",

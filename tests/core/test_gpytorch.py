@@ -200,14 +200,6 @@ def test_an_exact_gp_of_ones_own_is_cka(data):
     torch.testing.assert_close(variance, expected.variance[:, 0], rtol=1e-8, atol=1e-10)
 
 
-def test_as_single_task_gp(models):
-    Z, model = uniform(5, 2, seed=3), models[0]
-    assert isinstance(model.as_single_task_gp(), SingleTaskGP)
-    found = model.as_single_task_gp(len(model.u) - 1).posterior(Z)
-    expected = model.subset_draws(torch.tensor([len(model.u) - 1])).predict(Z)
-    same((found.mean, found.variance), expected, rtol=1e-4, atol=1e-7)
-
-
 def test_a_fitted_model_is_a_physics_by_its_predictions():
     X = uniform(12, 1)
     Y = 1.3 * wave(X) + X + 0.05 * normal(12, 1, seed=1)

@@ -121,7 +121,6 @@ REFUSED = [
     (lambda: TWO.subset_output([2]), ValueError, "numbers of outputs from 0 to 1"),
     (lambda: TWO.subset_output([0.5]), ValueError, "numbers of outputs from 0 to 1"),
     (lambda: TWO.posterior(X).scalarized(Y[0]), ValueError, "weights of 2 outputs"),
-    (lambda: TWO.as_single_task_gp(), ValueError, "Expected one output"),
     (lambda: cka()(X[:3]), RuntimeError, "call the model on its training inputs"),
     (lambda: cka().subset_draws(torch.zeros(4).long()).train()(X), RuntimeError, "holds 4 draws"),
     # Functions.

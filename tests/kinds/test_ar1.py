@@ -5,6 +5,7 @@ from itertools import product
 import pytest
 import torch
 from botorch.models.transforms import Normalize
+from gpytorch.kernels import MaternKernel, ScaleKernel
 
 from gpadjust.core import MATERN52, Stationary
 from gpadjust.core.data import unit_of
@@ -128,6 +129,22 @@ def test_units_of_both_levels():
     plain = drawn(AR1(X, Y, low_X=LOW_X, low_Y=LOW_Y))
     model = drawn(AR1(X, 1e6 * Y, low_X=LOW_X, low_Y=1e-6 * LOW_Y))
     torch.testing.assert_close(model.predict(Z).mean / 1e6, plain.predict(Z).mean)
+
+
+def test_a_summary_has_names_and_units_of_the_kernels():
+    kernel = ScaleKernel(MaternKernel())
+    options = {"low_covar_module": kernel, "delta_covar_module": kernel}
+    model = AR1(X, Y[:, :1], low_X=LOW_X, low_Y=LOW_Y[:, :1], **options)
+    low, delta = model.summary().split("  delta: ")
+    sizes = {name: value.sqrt().item() for name, value in model.values.items()}
+    assert (
+        f"standard deviation over that of low_Y: {sizes['low.kernel.raw_outputscale']:.3g}" in low
+    )
+    assert "base_kernel.lengthscale" in low
+    for name, part in (("standard deviation", "raw_outputscale"),
+                       ("standard deviation of the constant", "constant")):  # fmt: skip
+        size = sizes[f"delta.kernel.{part}"] * model.unit.item()
+        assert f"    {name}: {size:.3g}\n" in delta
 
 
 @pytest.mark.parametrize(("options", "words"), [

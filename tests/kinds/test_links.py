@@ -326,7 +326,6 @@ REFUSED = [
      r"(?s)-0.4, which.*clamp.*row 0: \[0.1\]"),
     (lambda: physics_mean().condition_on_observations(NEW, -NEW), ValueError, r"found -0\.05"),
     (lambda: physics_mean().predict(NEW, torch.ones(4, 1).double()), ValueError, "not negative"),
-    (lambda: physics_mean().as_single_task_gp(), TypeError, r"Gaussian in log\(y\)"),
     (lambda: physics_mean().posterior(NEW, posterior_transform=TOTAL), TypeError, "subset_output"),
     (lambda: linked(torch.nn.Linear), TypeError, "structure"),
 ]  # fmt: skip

@@ -48,7 +48,7 @@ def calm(model):
 def agree(one, two, tolerance=1e-8):
     close = {"rtol": tolerance, "atol": tolerance}
     for name in ("rho", "delta"):
-        torch.testing.assert_close(*(m.term(name, AT).variance for m in (one, two)), **close)
+        torch.testing.assert_close(*(m.term(name, AT).variance for m in (one.model, two)), **close)
     for noise in (False, True):
         same(one.predict(AT, noise), two.predict(AT, noise), **close)
     pair = (m.posterior(AT).distribution.covariance_matrix for m in (one, two))

@@ -309,7 +309,6 @@ REFUSED = [
     (lambda X, Y: make(X, Y, noise=HeavyTails()), ValueError, "CKA takes it"),
     (lambda X, Y: make(X, Y, nested=True), TypeError, "nested"),
     (lambda X, Y: fit(make(X, Y), num_draws=8), ValueError, "num_draws=None"),
-    (lambda X, Y: make(X, Y).as_single_task_gp(), NotImplementedError, "subset_rows"),
     (lambda X, Y: make(X, Y).condition_on_observations(X, Y).left_out(), NotImplementedError,
      "Build a model of all data"),
 ]  # fmt: skip
