@@ -61,6 +61,7 @@ def test_three_ways_to_the_most_likely_numbers(data):
         optimizer.zero_grad()
         loss(by_adam).backward()
         optimizer.step()
+    assert torch.equal(by_adam.draws, by_adam.u)
     fit_gpytorch_mll(ExactMarginalLogLikelihood(by_mll.likelihood, by_mll))
     fit(by_fit, "map")
     best = loss(by_fit).item()

@@ -13,7 +13,6 @@ from gpytorch.priors import GammaPrior, LogNormalPrior, UniformPrior
 
 from gpadjust import core
 from gpadjust.core import CKA, GP, Kernel, Noise, Stationary, Term, ZeroMeanGP, fit
-from gpadjust.kinds import HeavyTails
 from tests.systems import same, slopes, wave
 
 
@@ -97,22 +96,6 @@ class Growing(Noise):
         return torch.stack([torch.ones_like(x), x.square()], -1)
 
 
-class OfTargets(Noise):
-    """A noise with a prior around a tenth of the spread of the targets."""
-
-    def of_data(self, data, terms):
-        sd = 0.1 * data.Y.std().item() / terms.unit.item()
-        return Noise(priors=[core.LogNormal(sd**2, 2.0)])
-
-
-def test_a_noise_has_a_prior_by_the_data(data):
-    X, Y = data
-    model = CKA(X, Y, physics=wave, noise=HeavyTails(base=OfTargets()))
-    variance = model.likelihood.noise.detach()
-    expected = (0.1 * Y.std()).expand_as(variance)
-    torch.testing.assert_close(variance.sqrt(), expected, rtol=1e-6, atol=0.0)
-
-
 def test_a_noise_reads_inputs_as_the_user_gave_them(data):
     X, Y = data
     predicted = []
@@ -124,17 +107,6 @@ def test_a_noise_reads_inputs_as_the_user_gave_them(data):
         torch.testing.assert_close(noise.detach(), expected.detach(), rtol=1e-6, atol=1e-8)
         predicted.append(noise.detach())
     torch.testing.assert_close(*predicted)
-
-
-def test_numbers_after_a_search_of_ones_own(data):
-    """Summary and parameters are of what predictions are made with."""
-    model = ZeroMeanGP(*data)
-    fit(model)
-    assert len(model.draws) > len(model.u)
-    model.set_draws(model.u[:1])
-    with torch.no_grad():
-        model.u += 1.0
-    assert torch.equal(model.draws, model.u)
 
 
 KERNELS = {

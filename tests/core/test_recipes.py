@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gpadjust.core import CKA, KnownNoise, Noise, Stationary, ZeroMeanGP, fit, load, save
+from gpadjust.core import CKA, Stationary, fit
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 START = "\n## In a model\n"
@@ -93,31 +93,6 @@ def test_a_noise(problem):
     torch.testing.assert_close(noise, expected, rtol=1e-6, atol=1e-12)
 
 
-class Levels(Noise):
-    """Learnt noise times a known level of each output, which a subset takes along."""
-
-    def __init__(self, levels):
-        super().__init__(("level",))
-        self.levels = levels
-
-    def shares(self, places):
-        return self.levels.reshape(-1, 1, 1)
-
-    def of_outputs(self, outputs):
-        return type(self)(self.levels[list(outputs)])
-
-
-def test_a_noise_with_numbers_of_each_output(uniform):
-    X, levels = uniform(14, 1), torch.tensor([1.0, 10.0, 30.0, 100.0], dtype=torch.float64)
-    Y = law(X) + 0.05 * torch.randn(14, 4, dtype=torch.float64)
-    model = CKA(X, Y, physics=law, noise=Levels(levels))
-    part = model.subset_output([2]).predict(X, True).variance
-    torch.testing.assert_close(part, model.predict(X, True).variance[:, [2]])
-    model.noise.of_outputs = lambda outputs: model.noise
-    with pytest.raises(ValueError, match="of_outputs"):
-        model.subset_output([0]).predict(X, observation_noise=True)
-
-
 def test_a_basis(problem):
     X, Y, physics = problem
     model = recipe("A basis")["TrendCKA"](X, Y, physics=physics)
@@ -155,42 +130,3 @@ def test_a_link(problem):
 
 X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
 Y = (3 * X).sin()
-
-
-class Moved(Noise):
-    """Noise with a known mean at each training point, which rough fits show."""
-
-    def __init__(self, shift=0.0):
-        super().__init__()
-        self.shift = shift
-
-    @property
-    def settings(self):
-        return {"shift": self.shift}
-
-    def learnt(self, model, fitted):
-        residual = (model.data.Y - fitted(Noise()).predict(model.data.X).mean).mT / model.unit
-        return Moved(residual)
-
-
-def test_a_noise_learns_of_rows_by_rough_fits(tmp_path):
-    shifted = Y.clone()
-    shifted[3] += 5.0
-    model = ZeroMeanGP(X, shifted, noise=Moved(torch.zeros(1, 8, dtype=torch.float64)))
-    fit(model, "map")
-    expected = (shifted.mT / model.unit - model.noise.shift)[0]
-    torch.testing.assert_close(model.conditioning().targets[0, 0], expected)
-    mean, variance = model.left_out()
-    alpha = model.conditioning().alpha * model.unit
-    torch.testing.assert_close((model.data.Y - mean) / variance * model.unit**2, alpha.mT)
-    torch.testing.assert_close(model.with_noise(Noise()).conditioning().targets.mT[0, :, 0],
-                               (shifted / model.unit)[:, 0])  # fmt: skip
-    save(model, tmp_path / "model.pt")
-    again = load(tmp_path / "model.pt")  # with what it has learnt
-    torch.testing.assert_close(again.predict(X).mean, model.predict(X).mean)
-
-
-def test_known_noise_of_further_observations():
-    known = ZeroMeanGP(X, Y, noise=KnownNoise(torch.full((1, 8), 0.1).double()))
-    later = known.condition_on_observations(X[:1] + 0.3, Y[:1], known.unit.square() * 0.4)
-    torch.testing.assert_close(later.noise.known[0, -2:], torch.tensor([0.1, 0.4]).double())

@@ -49,6 +49,13 @@ class Negative(NoShares):
         return -torch.stack([places.X[..., 0], places.X[..., 0]], -1)
 
 
+class Forgetful(Noise):
+    """A noise with numbers of two outputs, of which a subset does not take its own."""
+
+    def shares(self, places):
+        return torch.tensor([1.0, 10.0]).double().reshape(2, 1, 1)
+
+
 def fantasy():
     return ZERO.fantasize(X[:2].expand(3, 2, 1), SobolQMCNormalSampler(torch.Size([2])))
 
@@ -107,6 +114,8 @@ REFUSED = [
     (lambda: ZeroMeanGP(X, Y, 0.01, noise=Noise()), ValueError, "found both"),
     (lambda: ZeroMeanGP(X, Y, noise=NoShares()).predict(X, True), ValueError, "override"),
     (lambda: ZeroMeanGP(X, Y, noise=Negative()).predict(X, True), ValueError, "negative"),
+    (lambda: CKA(X, waves(X), physics=waves, noise=Forgetful()).subset_output([0]).predict(X, True),
+     ValueError, "of_outputs"),
     (lambda: choices(("a", 1.0)), ValueError, "several"),
     (lambda: choices(("a", 0.7), ("b", 0.7)), ValueError, "sum to 1"),
     (lambda: choices(("a", 1.5), ("b", -0.5)), ValueError, "positive"),

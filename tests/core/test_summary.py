@@ -127,13 +127,6 @@ def test_of_noise(fantasies):
     assert lines(known)["g"] == "prior mean 1"
 
 
-def test_without_constants():
-    text = ZeroMeanGP(X[:, :1], Y, constants=False).summary()
-    assert "constant" not in text
-    assert "    lengthscale of x: 2\n" in text
-    assert "probabilities" not in text
-
-
 def table(model):
     return model.priors().set_index("name")
 

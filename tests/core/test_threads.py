@@ -9,20 +9,17 @@ import torch
 from threadpoolctl import threadpool_info
 
 from gpadjust.core import CKA, fit
-from gpadjust.kinds import AR1
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.threads import threads_for
 from tests.systems import ripple, same, uniform
 
 
-@pytest.mark.parametrize("cls", [CKA, AR1])
-def test_conditioning_leaves_the_model_whole_also_in_another_thread(cls, drawn):
+def test_conditioning_leaves_the_model_whole_also_in_another_thread(drawn):
     def first(X):
         return ripple(X)[..., :1]
 
     X = uniform(9, 2)
-    options = {"bounds": [[0, 0], [1, 1]], "num_low": 8} if cls is AR1 else {}
-    model = drawn(cls(X, 1.2 * first(X) + X[:, 1:], physics=first, **options))
+    model = drawn(CKA(X, 1.2 * first(X) + X[:, 1:], physics=first))
     Z, more = uniform(6, 2, seed=1), uniform(2, 2, seed=5)
     observed = first(more)
     done = Event()

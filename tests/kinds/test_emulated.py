@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, fit
+from gpadjust.core import CKA, CalibratedPhysics, fit
 from gpadjust.kinds.emulated import EmulatedPhysics
 from gpadjust.kinds.links import LinkedCKA
 from gpadjust.physics import FunctionPhysics, Unknown
@@ -52,23 +52,6 @@ def test_several_outputs_have_errors_of_their_own_size():
     sd = physics.emulator.predict(FAR[:1]).variance[0].sqrt()
     torch.testing.assert_close(values.std(0), sd, rtol=0.1, atol=0.0)
     assert abs(values.T.corrcoef()[0, 1]) < 0.2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("n", [8, 60])
-def test_with_dense_runs_results_are_those_of_the_simulator(n):
-    """By draws from the prior, and from Laplace's approximation."""
-    runs, X = 1.5 * line(40), 1.2 * line(n) + 0.1
-    known = EmulatedPhysics(runs, wave(runs), num_components=2)
-    data = X, wave(X) + 0.1 * X + 0.02 * normal(n, 1), torch.full_like(X, 0.02**2)
-    found = []
-    for physics in (known, wave):
-        model = PhysicsMeanGP(*data, physics=physics)
-        fit(model)
-        found.append(model.predict(1.4 * line(9)))
-    (a, a_variance), (b, b_variance) = found
-    assert ((a - b).abs() < 0.6 * b_variance.sqrt()).all()
-    torch.testing.assert_close(a_variance.sqrt(), b_variance.sqrt(), rtol=0.3, atol=1e-3)
 
 
 @pytest.mark.slow

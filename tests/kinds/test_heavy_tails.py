@@ -123,23 +123,6 @@ def test_a_file_has_the_share(tmp_path):
     assert load(tmp_path / "model.pt", trusted=True).noise.share == 0.1
 
 
-def test_later_rows_have_no_corrections():
-    added = torch.zeros(1, 20, dtype=torch.float64)
-    added[0, ROWS] = 1e5
-    model = drawn(CKA(X, gross(), 0.03**2, physics=wave, noise=HeavyTails(added=added)))
-    later = model.condition_on_observations(Z, truth(Z) + 1, torch.full((3, 1), 0.01).double())
-    values = later.table.values(later.u)
-    noise, base = (
-        n.variance(values, later.places(later.data.X, values), True)
-        for n in (later.noise, later.noise.base)
-    )
-    torch.testing.assert_close((noise - base)[0, 0, :20], added[0])
-    assert not (noise - base)[..., 20:].any()
-    torch.testing.assert_close(
-        later.noise.known[0, 20:] * model.unit.square(), noise.new_full((1, 3), 0.01)
-    )
-
-
 REFUSED = [
     (lambda: HeavyTails(share=0.6), ValueError, "below 0.5"),
     (lambda: HeavyTails(base=0.1), TypeError, "train_Yvar"),

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.nn.functional import silu
 
-from gpadjust.core import CKA, GP, CalibratedPhysics, Term, fit, load, save
+from gpadjust.core import CKA, GP, CalibratedPhysics, Term, ZeroMeanGP, fit, load, save
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.noisy_inputs import NoisyInputs
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, Unknown
@@ -149,12 +149,16 @@ def test_bad_input(call, error, words):
 
 
 def test_later_inputs_are_exact():
-    physics = lambda X: X.sin().expand(-1, 2)  # noqa: E731
-    model = model_of(X, torch.cat([Y, 2 * Y.flip(0)], -1), SD**2, physics=physics)
-    fit(model, "map")
-    assert (model.noise.added.amax(-1) > 10 * model.noise.added.amin(-1)).all()
+    added, moved = torch.full((2, 30), 0.1).double(), torch.full((2, 30), 0.2).double()
+    noisy = NoisyInputs(X, SD**2, added=added, moved=moved)
+    model = ZeroMeanGP(noisy.X, torch.cat([Y, 2 * Y.flip(0)], -1), noise=noisy)
+    # (y - left-out mean) / variance is K^-1 (y - mean - shift).
+    mean, variance = model.left_out().prediction
+    alpha = model.conditioning().alpha[0].mT / model.unit.mT
+    torch.testing.assert_close((model.data.Y - mean) / variance, alpha)
     later = model.condition_on_observations(TEST[:1], 3 + truth(TEST[:1]).expand(-1, 2))
     assert (later.predict(TEST[:1]).mean > model.predict(TEST[:1]).mean).all()
-    assert not later.noise.added[:, 30:].any()
-    assert not later.noise.shift[:, 30:].any()
+    for corrections in (later.noise.added, later.noise.shift):
+        assert corrections[:, :30].all()
+        assert not corrections[:, 30:].any()
     fit(later, "map")
