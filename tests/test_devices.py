@@ -38,13 +38,11 @@ ALLOWED = {
     "drawn on the CPU, so that a seed says the same everywhere, and moved": {
         "core/fourier.py __init__",
         "core/model.py sample_functions",
-        "core/stacked.py sample_functions",
     },
     "numbers that become Python's, a file's, or are moved where they are used": {
         "core/stacked.py _shares",
         "core/unknowns.py __init__",
         "kinds/links.py parse",
-        "kinds/vanishing.py __init__",
         "physics/parameters.py __init__",
         "physics/unknown.py _tails",
         "physics/unknown.py guess",

@@ -155,7 +155,7 @@ REFUSED = [
     (lambda: StackedGP(PAIR, [1.0]), ValueError, "in shape"),
     (lambda: StackedGP(PAIR, {"a": 0.5, "none": 0.5}), ValueError, "in shape"),
     (lambda: StackedGP(PAIR, [0.5, 0.5], 0), ValueError, "num_components"),
-    (lambda: StackedGP(PAIR, [0.5, 0.5]).sample_functions(0), ValueError, "num_functions"),
+    (lambda: StackedGP(PAIR, [0.5, 0.5]).sample_functions(3), NotImplementedError, r"models\[0\]"),
 ]  # fmt: skip
 
 

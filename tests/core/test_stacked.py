@@ -1,6 +1,5 @@
 """Mixtures of several models."""
 
-import pytest
 import torch
 from botorch.acquisition import LogExpectedImprovement, qLogExpectedImprovement
 from botorch.acquisition.objective import ScalarizedPosteriorTransform
@@ -105,27 +104,6 @@ def test_acquisition_functions():
         assert value.shape == (4,)
         (slope,) = torch.autograd.grad(value.sum(), points)
         assert slope.isfinite().all()
-
-
-@pytest.mark.parametrize("weights", [[0.25, 0.75], [[0.25, 0.5], [0.75, 0.5]]])
-def test_functions_are_of_each_model_in_proportion(weights):
-    stacked = StackedGP(parts(2), weights, 8)
-    functions = stacked.sample_functions(16, seed=1, num_features=64)
-    values = functions(Z[:2])
-    assert values.shape == (16, 2, 2)
-    torch.testing.assert_close(functions(Z[:2].expand(3, 2, 1))[:, 1], values)
-    points = torch.stack([Z[i % 3 : i % 3 + 2] for i in range(16)])
-    each = functions.evaluate_each(points)
-    for i in range(16):
-        torch.testing.assert_close(each[i], functions(points[i])[i])
-    shares = torch.tensor(weights).reshape(2, -1).expand(2, 2)
-    assert torch.equal((functions.owners == 0).float().mean(0), shares[0])
-    repeated = stacked.sample_functions(16, seed=1, num_features=64)(Z[:2])
-    assert torch.equal(repeated, values)
-    values = stacked.sample_functions(2000, seed=0, num_features=256)(Z)
-    mean, variance = stacked.predict(Z)
-    assert ((values.mean(0) - mean) / variance.sqrt()).abs().max() < 0.1
-    torch.testing.assert_close(values.var(0), variance, rtol=0.15, atol=0)
 
 
 def test_weights_by_left_out():
