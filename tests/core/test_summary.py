@@ -149,13 +149,14 @@ def test_priors_are_in_the_users_units_and_stay_after_a_fit():
 
 
 RHO = Stationary(outputscale=LogNormal(0.04, 2.0))
-DELTA = Stationary(lengthscale=LogNormal(0.5, 2.0))
+SHORT = Stationary(lengthscale=LogNormal(0.5, 2.0))
 
 
 @pytest.mark.parametrize(("options", "name", "median"), [
     ({"constants": {"rho": LogNormal(0.25, 2.0)}}, "rho standard deviation of the constant", 0.5),
     ({"rho_covar_module": RHO}, "rho standard deviation", 0.2),
-    ({"delta_covar_module": DELTA}, "delta lengthscale of x", 2.5),
+    ({"rho_covar_module": SHORT}, "rho lengthscale of x", 2.5),
+    ({"delta_covar_module": SHORT}, "delta lengthscale of x", 2.5),
 ])  # fmt: skip
 def test_each_prior_is_replaced_by_one_argument(options, name, median, tmp_path):
     changed, usual = table(of_waves(**options)), table(of_waves())

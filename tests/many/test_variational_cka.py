@@ -11,6 +11,7 @@ from botorch.models.transforms import Normalize
 from gpadjust.core import fit, load, save
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.many import VariationalCKA
+from gpadjust.physics import FunctionPhysics, Unknown
 from tests.many.numbers import at_random, exact_of, physics_of, problem, truth
 from tests.systems import line, normal, refused, same, waves
 
@@ -254,13 +255,18 @@ def test_an_error_leaves_the_model_as_it_was(monkeypatch):
     assert all(map(torch.equal, model.predict(line(4)), prediction))
 
 
-@pytest.mark.parametrize("case", ["constant", "few rows"])
-def test_inputs_that_do_not_vary_and_few_rows(case):
-    X, Y = problem(30)
-    X = {"constant": torch.cat([X, torch.ones_like(X)], dim=-1), "few rows": X[:4]}[case]
-    model = make(X, Y[: len(X)])
-    assert fit(model).log_evidence.isfinite().all()
-    assert (model.predict(X).mean - model.data.Y).std() < 0.2
+@pytest.mark.parametrize("case", ["constant", "few rows", "unknown parameters"])
+def test_inputs_that_do_not_vary_few_rows_and_unknown_parameters(case):
+    X, Y = problem(30, 2)
+    X = {"constant": torch.cat([X, torch.ones_like(X)], dim=-1), "few rows": X[:4]}.get(case, X)
+    unknowns = {"w": Unknown(5.0, sd=1.0)}
+    law = FunctionPhysics(lambda X, p: waves(p.w[:, None] * X[:, :1] / 6), unknowns=unknowns)
+    is_shared = case == "unknown parameters"
+    model = make(X, Y[: len(X)], physics=law if is_shared else waves)
+    evidence = fit(model).log_evidence
+    assert evidence.shape == ((1,) if is_shared else (2,))
+    assert evidence.isfinite().all()
+    assert ((model.predict(X).mean - model.data.Y).std(0) < 0.2).all()
 
 
 REFUSED = [
