@@ -2,8 +2,6 @@
 
 import pytest
 import torch
-from gpytorch.kernels import MaternKernel, PeriodicKernel, RBFKernel, ScaleKernel
-from gpytorch.priors import GammaPrior
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,18 +10,6 @@ from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, Stationary
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.core.noises import Relative
 from tests.systems import crude, normal, same, slopes, truth, uniform
-
-
-class Own(core.Kernel):
-    """A rational quadratic kernel, without derivatives by hand."""
-
-    def rows(self, x, num_outputs):
-        return [core.Row.positive("size", x.new_ones(num_outputs, 1), 2.0)]
-
-    def covariance(self, own, x, other=None):
-        other = x if other is None else other
-        squares = (x.unsqueeze(-2) - other.unsqueeze(-3)).square().sum(-1)
-        return 1 / (1 + squares / own["size"].unsqueeze(-1))
 
 
 def law(X, p):
@@ -47,8 +33,6 @@ def of(cls, *Yvar, **options):
 UNKNOWN = known({})
 OTHER = FunctionPhysics(second, unknowns=UNKNOWN.unknowns)
 BOUNDED = known({"w": Unknown(3.0, bounds=(2.0, 4.0))})
-SUM = ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=2)) + PeriodicKernel()
-WITH_PRIOR = RBFKernel(lengthscale_prior=GammaPrior(3.0, 6.0))
 MODELS = {
     "PhysicsMeanGP, known noise": of(core.PhysicsMeanGP, 0.01, physics=crude),
     "two physics": of(CKA, physics=[crude, lambda X: crude(X).sin()], rho_mean=[0.7, 0.1]),
@@ -58,9 +42,6 @@ MODELS = {
     "known and unknown": of(CKA, physics=[crude, BOUNDED]),
     "calibrated, known noise": of(core.CalibratedPhysics, 0.01, physics=UNKNOWN),
     "relative noise of unknown parameters": of(CKA, physics=UNKNOWN, noise=Relative()),
-    "own kernel": of(core.ZeroMeanGP, covar_module=Own()),
-    "GPyTorch, sum": of(CKA, physics=crude, delta_covar_module=SUM, nested=False),
-    "GPyTorch, prior": of(core.ZeroMeanGP, covar_module=ScaleKernel(WITH_PRIOR)),
 }
 
 

@@ -75,6 +75,9 @@ def test_a_kernel_of_ones_own(data, uniform):
     same(model.predict(Z), (joint.mean, joint.variance), rtol=1e-6, atol=1e-9)
     batch = model.predict(Z.expand(3, 50, 2))
     torch.testing.assert_close(batch.variance[1], joint.variance, rtol=1e-6, atol=1e-9)
+    u = model.u.detach() + 0.1
+    expected = slopes(lambda u: model.log_likelihood(u)[0], u)
+    torch.testing.assert_close(model.log_likelihood(u)[1], expected, rtol=1e-5, atol=1e-5)
 
 
 def test_a_prior_with_ends(data):

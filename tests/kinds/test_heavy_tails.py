@@ -123,6 +123,14 @@ def test_a_file_has_the_share(tmp_path):
     assert load(tmp_path / "model.pt", trusted=True).noise.share == 0.1
 
 
+def test_later_rows_have_no_corrections():
+    added = torch.zeros(1, 20, dtype=torch.float64)
+    added[0, ROWS] = 1e5
+    later = HeavyTails(added=added).appended(None, 3)
+    assert later.added.shape == (1, 23)
+    assert rows_of(later.added) == ROWS
+
+
 REFUSED = [
     (lambda: HeavyTails(share=0.6), ValueError, "below 0.5"),
     (lambda: HeavyTails(base=0.1), TypeError, "train_Yvar"),

@@ -9,7 +9,7 @@ import torch
 from gpadjust.core import CKA, RRA, PhysicsMeanGP
 from gpadjust.kinds.links import LinkedCKA
 from gpadjust.kinds.updates import Kalman, Window, design
-from tests.systems import line, normal, refused, same, uniform, wave, waves
+from tests.systems import drawn, line, normal, refused, same, uniform, wave, waves
 
 AT = line(7, -0.2, 1.2)
 
@@ -24,16 +24,9 @@ X, Y = rows(12, 0)
 NEW_X, NEW_Y = rows(9, 1)
 
 
-def held(model):
-    """Three draws of all numbers, without a fit."""
-    u = 0.3 * normal(3, *model.u.shape[1:])
-    model.set_draws(torch.cat([model.table.with_choice(u[[k]], k) for k in range(3)]))
-    return model.eval()
-
-
 def rra(x=X, y=Y, *known, **options):
     physics = waves if y.shape[-1] == 2 else wave
-    return held(RRA(x, y, *known, physics=physics, num_features=20, **options))
+    return drawn(RRA(x, y, *known, physics=physics, num_features=20, **options), 3)
 
 
 def calm(model):
@@ -86,8 +79,7 @@ def test_with_forgetting_it_is_a_regression_whose_noise_grows_with_age():
 
 @pytest.mark.parametrize("build", [CKA, PhysicsMeanGP])
 def test_a_window_is_the_model_of_its_last_rows(build):
-    model = build(X, Y, physics=wave)
-    model = held(model) if model.table.choices else model.eval()
+    model = drawn(build(X, Y, physics=wave), 3)
     window = Window(model, 10)
     for i in range(9):
         window.update(NEW_X[i : i + 1], NEW_Y[i : i + 1])
