@@ -96,9 +96,11 @@ def _ratio(later: pd.DataFrame, other: str) -> Difference:
 
 
 def _costs(curves: Curves, learner: str) -> str:
-    """The mean cost of each trial, with the standard error of the mean over the later ones."""
+    """The mean cost of each trial, with the standard error over the later ones, and few runs."""
     if learner not in curves.names:
         return ""
     means = "; ".join(number(mean, ".2f") for mean in curves.mean(learner))
     error = number(curves.window(learner, 2, 3).sem(), ".2f")
-    return f"{means} (± {error})" if error else means
+    runs = len(curves.seeds(learner))
+    few = f", {runs} runs" if runs < curves.runs["seed"].nunique() else ""
+    return f"{means} (± {error}{few})" if error else means

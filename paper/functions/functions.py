@@ -30,6 +30,7 @@ from paper.functions.problems import PROBLEMS
 from paper.parameters.laws import case
 
 MOST, TOO_MUCH = 1.05, 1.3  # of the formula's error
+_LEAST_DRAWN = 0.1  # ratio; smaller ones are drawn as triangles
 _CELL = ["problem", "n"]
 _GROUP = {name: group for group, names in NAMES.items() for name in names}
 LAWS = NAMES["law"]
@@ -139,7 +140,9 @@ def tables(runs: Sequence[Run], experiment: Functions) -> dict[str, Table]:
         "formula": Table("CKA beside its formula, fitted", table(parts, worse, "the formula is")),
         "learners": Table("All learners", table(parts, each, "the formula is")),
         "rho": Table("CKA beside delta alone, and a GP", table(parts, rho, "the formula is")),
-        "cells": Table("Each cell, medians over data sets", table(cells, single, "problem, n")),
+        "cells": Table(
+            "Each cell: geometric means of ratios, median error", table(cells, single, "problem, n")
+        ),
     }
 
 
@@ -183,17 +186,23 @@ def _worst(part: pd.DataFrame) -> str:
 
 
 def draw(runs: Sequence[Run], experiment: Functions) -> list[Path]:
-    """Draw the ratio of each cell to the formula, sorted, with its interval, by group."""
+    """Draw the ratio of each cell to the formula, sorted, with its interval, or a triangle."""
     parts = _grouped(runs)
     figure, axes = panels([*parts], 3, (3.2, 2.8))
     for ax, part in zip(axes, parts.values(), strict=True):
         order = sorted(_ratios(part, "formula").values(), key=lambda each: each.mean)
         middle = np.exp([each.mean for each in order])
         ends = [np.exp([each.low for each in order]), np.exp([each.high for each in order])]
-        ax.vlines(range(len(order)), *ends, color="0.7", lw=1.5)
-        ax.plot(range(len(order)), middle, ".", color="navy", ms=4)
+        below = middle < _LEAST_DRAWN
+        places, floor = np.arange(len(order)), 1.15 * _LEAST_DRAWN
+        ax.vlines(places[~below], *(each[~below] for each in ends), color="0.7", lw=1.5)
+        ax.plot(places[~below], middle[~below], ".", color="navy", ms=4)
+        ax.plot(places[below], [floor] * below.sum(), "v", color="navy", ms=3)
         ax.axhline(1, color="0.3", lw=0.8)
         ax.axhline(TOO_MUCH, color="tab:red", lw=0.8, ls=":")
-        ax.set(yscale="log", xlabel="cells, sorted", xticks=[])
+        ax.set(yscale="log", ylim=(_LEAST_DRAWN, 4), xlabel="cells, sorted", xticks=[])
+        ticks = (0.1, 0.2, 0.5, 1, 2)
+        ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        ax.minorticks_off()
     axes[0].set_ylabel("error, CKA / formula fitted")
     return [save(figure, experiment.folder / "functions.png")]

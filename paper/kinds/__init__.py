@@ -23,7 +23,7 @@ class Kinds(Experiment):
             "drift": "a pump that wears, a step ahead",
             "vanishing": "gravity, of a ball in air without its drag",
             "emulated": "f_p known by 40 runs",
-            "balldrop": "measured drops of a ball that was left out",
+            "balldrop": "drops of a ball that was left out",
         },
         "learner": {"plain": "plain", "option": "option"},
     }
@@ -32,5 +32,5 @@ class Kinds(Experiment):
     )
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """All; of the balls, whose data are measured, two seeds of the fit."""
+        """All; of the balls, whose data are given, two seeds of the fit."""
         return self.seeds[:2] if kind[0] == "balldrop" else self.seeds

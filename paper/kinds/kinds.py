@@ -347,11 +347,13 @@ def _better(part: pd.DataFrame) -> str:
 
 
 _LOGARITHMIC = ("relative", "links")
+_LESS_TRUTH = ("vanishing",)
+_LINES = {"balldrop": "mean"}  # of measured data, whose truth is unknown
 _AXES = {
     "links": ("voltage [V]", "current [A]"),
     "categories": ("flow, of one material on one rig", "head [m]"),
     "drift": ("step", "head less its prediction [m]"),
-    "vanishing": ("time [s]", "height [m]"),
+    "vanishing": ("time [s]", "height less its truth [m]"),
     "balldrop": ("height [m]", "drop time [s]"),
 }
 
@@ -370,9 +372,12 @@ def _drawn(kind: str, pair: dict[str, dict[str, list[float]]], folder: Path) -> 
     figure, axes = panels([*OPTIONS[kind]], 2, (4.3, 3.0))
     for ax, learner, color in zip(axes, ("plain", "option"), ("0.5", "#D55E00"), strict=True):
         line = {name: np.array(values) for name, values in pair[learner].items()}
+        if kind in _LESS_TRUTH:
+            line["data_y"] -= np.interp(line["data_x"], line["x"], line["truth"])
+            line |= {name: line[name] - line["truth"] for name in ("low", "high", "truth")}
         low = line["low"].clip(1e-9) if kind in _LOGARITHMIC else line["low"]
         ax.fill_between(line["x"], low, line["high"], color=color, alpha=0.4, lw=0, label="95 %")
-        ax.plot(line["x"], line["truth"], color="0.1", lw=1, label="truth")
+        ax.plot(line["x"], line["truth"], color="0.1", lw=1, label=_LINES.get(kind, "truth"))
         ax.plot(line["data_x"], line["data_y"], ".", color="#0072B2", ms=4, label="observations")
         if kind in _LOGARITHMIC:
             least = min(line["truth"].min(), line["data_y"].clip(1e-9).min())

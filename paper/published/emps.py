@@ -178,8 +178,8 @@ def draw(runs: Sequence[Run], experiment: Emps) -> list[Path]:
     """Draw the errors of the first free run of each learner."""
     paths = {run["learner"]: run["path"] for run in runs if run["seed"] == experiment.seed}
     labels = experiment.axes["learner"]
-    shown = {name: labels[name] for name in ("fitted", "delta", "cka") if name in paths}
-    figure, axes = panels([*shown.values()], 3, (3.6, 3.0))
+    shown = {name: labels[name] for name in ("fitted", "delta", "cka", "gp") if name in paths}
+    figure, axes = panels([*shown.values()], 4, (2.9, 3.0))
     for ax, path in zip(axes, [paths[name] for name in shown], strict=True):
         seconds = _SAMPLING * experiment.every * (4 + 4 * np.arange(len(path["off"])))
         ax.fill_between(seconds, path["low"], path["high"], color="tab:blue", alpha=0.25, lw=0)
