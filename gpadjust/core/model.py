@@ -572,15 +572,15 @@ class GP(gpytorch.models.GP, Predictive):
 
     def left_out(self) -> Marginals:
         """Return the distribution of each target given all others, with noise; NaN if missing."""
-        return self.marginals_of(*self.left_out_by(self.conditioning()))
+        return self.marginals_of(*self.left_out_at())
 
-    @torch.no_grad()
-    def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means and variances of left-out targets at coordinates ``S x B x P``."""
-        return self.left_out_by(self.conditioned(*self._observed(self.table.values(u))))
-
-    def left_out_by(self, conditioning: Conditioning) -> tuple[Tensor, Tensor]:
-        """Return means and variances of left-out targets, ``S x n x m``, by a posterior."""
+    def left_out_at(self, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return means and variances of left-out targets at ``S x B x P``, or at the draws."""
+        if u is None:
+            conditioning = self.conditioning()
+        else:
+            with torch.no_grad():
+                conditioning = self.conditioned(*self._observed(self.table.values(u)))
         mean, variance = conditioning.left_out()
         mean = mean + self.noise.shift  # targets are y / unit - shift
         return (mean * self.unit).mT, (variance * self.unit.square()).mT

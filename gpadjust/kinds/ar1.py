@@ -11,7 +11,6 @@ from torch import Tensor
 from gpadjust.checks import checked_bounds, checked_whole
 from gpadjust.core import GP, KnownNoise, Noise, Row, Term
 from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, names_of, unit_of
-from gpadjust.core.gaussian import Conditioning
 from gpadjust.core.kernels import STANDARD_DEVIATION, Features, Kernel, PullBack
 from gpadjust.core.structures import DELTA_CONSTANT
 from gpadjust.core.terms import Places, as_kernel
@@ -107,10 +106,10 @@ class AR1(GP):
             return high
         return appended((self.low.Y.mT / self._low_unit()).to(high), high, -1)
 
-    def left_out_by(self, conditioning: Conditioning) -> tuple[Tensor, Tensor]:
-        """Return means and variances of left-out targets of the high level, by a posterior."""
+    def left_out_at(self, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return means and variances of left-out targets of the high level."""
         high = slice(len(self.low.X), None)
-        mean, variance = super().left_out_by(conditioning)
+        mean, variance = super().left_out_at(u)
         return mean[..., high, :], variance[..., high, :]
 
     def subset_output(self, idcs: list[int]) -> Self:
