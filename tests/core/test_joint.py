@@ -108,7 +108,7 @@ def test_the_density_of_rho_where_some_draws_know_it(model_of, uniform, close):
 
 
 def test_outputs_by_number(model_of, uniform, alike, close):
-    model, _ = model_of("CKA")
+    model, X = model_of("CKA")
     Z, whole = uniform(5, 2), model.posterior(uniform(5, 2))
     for outputs in ([1, 0], [-1]):
         subset = model.subset_output(outputs)
@@ -117,6 +117,8 @@ def test_outputs_by_number(model_of, uniform, alike, close):
         close(first.predict(Z).mean, whole.mean[:, outputs[:1]])
         u = subset.u.detach()
         close(subset.log_likelihood(u)[0], model.log_likelihood(model.u)[0][:, outputs])
+    known = CKA(X, model.data.Y, torch.tensor([0.01, 0.4]).double(), physics=crude)
+    close(known.subset_output([1]).predict(Z).mean, known.predict(Z).mean[:, [1]])
 
 
 def test_the_posterior_of_gpytorch(model_of, uniform, close):
