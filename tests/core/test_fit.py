@@ -86,6 +86,7 @@ def test_fitted_twice_is_fitted_once(n):
     second = fit(model, seed=3)
     assert all(map(torch.equal, once, model.predict(X)))
     assert torch.equal(first.log_evidence, second.log_evidence)
+    assert not torch.equal(fit(model, seed=4).log_evidence, second.log_evidence)
 
 
 def test_the_approximation_of_a_normal_posterior_is_exact():
