@@ -14,7 +14,7 @@ ALLOWED = {
     "numbers of rows or draws, which index tensors of any device": {
         "core/fitting.py": "_parts _evenly modes",
         "core/functions.py": "__init__",
-        "core/model.py": "as_single_task_gp log_likelihood",
+        "core/model.py": "log_likelihood",
         "core/nuts.py": "proposed",
         "physics/formula.py": "_parsed",
         "core/saving.py": "_built_with _content",
@@ -30,13 +30,11 @@ ALLOWED = {
     "drawn on the CPU, so that a seed says the same everywhere, and moved": {
         "core/fourier.py": "__init__",
         "core/model.py": "sample_functions",
-        "core/stacked.py": "sample_functions",
     },
     "numbers that become Python's, a file's, or are moved where they are used": {
         "core/stacked.py": "_shares",
         "core/unknowns.py": "__init__",
         "kinds/links.py": "parse",
-        "kinds/vanishing.py": "__init__",
         "physics/parameters.py": "__init__",
         "physics/unknown.py": "_tails guess knots",
     },

@@ -54,7 +54,6 @@ class FitResult:
             outputs that share unknown numbers, of all together); None of a point fit and of NUTS, a
             lower bound of many rows.
         probabilities: The probability of each nested model by its text, for each output.
-        effective: The least number of starting draws that count, of all outputs.
         error: Change of the mean at a left-out training input by another seed, root mean square, in
             predicted standard deviations; NaN of a point fit.
         num_draws: How many draws predictions average over.
@@ -66,7 +65,6 @@ class FitResult:
     method: str
     log_evidence: Tensor | None = None
     probabilities: dict[str, list[float]] = field(default_factory=dict)
-    effective: float = math.nan
     error: float = math.nan
     num_draws: int = 1
     parameter_error: float = math.nan
@@ -224,7 +222,6 @@ def _averaged(model: GP, num_draws: int | None, seed: int) -> FitResult:
         "bayes",
         _evidence(model, sampled),
         {choice.text: probabilities for choice, probabilities in choices},
-        min(float(draws.effective.min()) for draws in sampled.values()),
         _error(model, groups) * math.sqrt(number / averaged),
         len(model.u),
         parameter_error,
@@ -307,7 +304,7 @@ def _joined(draws: Draws, others: Draws, is_missed: Tensor) -> Draws:
         counts = _counts(logs.softmax(0), len(u))
         parts += [_evenly(u, counts[0]), _evenly(v[missed], counts[1])]
         evidence.append(logs.logsumexp(0, keepdim=True))
-    return Draws(torch.cat(parts), torch.stack(evidence), draws.effective)
+    return Draws(torch.cat(parts), torch.stack(evidence))
 
 
 def _evenly(u: Tensor, number: int) -> Tensor:

@@ -32,7 +32,8 @@ class Fourier(Stationary):
         d = data.kernel_inputs(data.X[:1]).shape[-1]
         if d == len(self.frequencies):
             return self
-        return type(self)(d, 2 * self.frequencies.shape[-1], self.seed, self.outputscale)
+        number = 2 * self.frequencies.shape[-1]
+        return type(self)(d, number, self.seed, self.outputscale or DELTA)
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the inner products of the features."""

@@ -157,15 +157,13 @@ class Stationary(Kernel):
         lengthscale: LogNormal = lengthscale,
     ) -> None:  # fmt: skip
         self.profile = profile
-        self.outputscale = outputscale or DELTA
+        self.outputscale = outputscale
         self.lengthscale = lengthscale
-        self.has_outputscale = outputscale is not None
 
     def of_term(self, outputscale: LogNormal) -> Stationary:
         """Return the kernel with the prior variance of a term, if it has none."""
         new = copy(self)
-        if not self.has_outputscale:
-            new.outputscale = outputscale
+        new.outputscale = self.outputscale or outputscale
         return new
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
@@ -173,10 +171,11 @@ class Stationary(Kernel):
         ranges = x.amax(-2) - x.amin(-2)
         ranges = ranges.where(ranges > 0, torch.ones_like(ranges))
         length = (self.lengthscale.median * len(ranges) * ranges).expand(num_outputs, -1)
-        scale = length.new_full((num_outputs, 1), self.outputscale.median)
+        prior = self.outputscale or DELTA
+        scale = length.new_full((num_outputs, 1), prior.median)
         return [
             Row.positive("lengthscale", length, self.lengthscale.factor),
-            Row.positive("outputscale", scale, self.outputscale.factor),
+            Row.positive("outputscale", scale, prior.factor),
         ]
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:

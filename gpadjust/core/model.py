@@ -10,11 +10,9 @@ from typing import Any, NoReturn, Self
 import gpytorch
 import torch
 from botorch.acquisition.objective import PosteriorTransform, ScalarizedPosteriorTransform
-from botorch.models import SingleTaskGP
 from botorch.models.model import FantasizeMixin, Model
 from botorch.models.transforms.outcome import Standardize
 from botorch.sampling.pathwise.posterior_samplers import DrawMatheronPaths
-from botorch.settings import validate_input_scaling
 from gpytorch.distributions import MultivariateNormal
 from gpytorch.kernels import AdditiveKernel
 from gpytorch.likelihoods import GaussianLikelihood
@@ -574,15 +572,17 @@ class GP(gpytorch.models.GP, Predictive):
 
     def left_out(self) -> Marginals:
         """Return the distribution of each target given all others, with noise; NaN if missing."""
-        mean, variance = self.conditioning().left_out()
-        mean = mean + self.noise.shift  # targets are y / unit - shift
-        return self.marginals_of((mean * self.unit).mT, (variance * self.unit.square()).mT)
+        return self.marginals_of(*self.left_out_at())
 
-    @torch.no_grad()
-    def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means and variances of left-out targets at coordinates ``S x B x P``."""
-        mean, variance = self.conditioned(*self._observed(self.table.values(u))).left_out()
-        mean = mean + self.noise.shift
+    def left_out_at(self, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return means and variances of left-out targets at ``S x B x P``, or at the draws."""
+        if u is None:
+            conditioning = self.conditioning()
+        else:
+            with torch.no_grad():
+                conditioning = self.conditioned(*self._observed(self.table.values(u)))
+        mean, variance = conditioning.left_out()
+        mean = mean + self.noise.shift  # targets are y / unit - shift
         return (mean * self.unit).mT, (variance * self.unit.square()).mT
 
     def components(
@@ -864,28 +864,6 @@ class GP(gpytorch.models.GP, Predictive):
         if x.shape != self.data.X.shape or not torch.equal(x, self.data.X):
             raise RuntimeError("In training mode call the model on its training inputs.")
         return self.forward(self.data.X)
-
-    def as_single_task_gp(self, draw: int | None = None) -> SingleTaskGP:
-        """Return BoTorch's ``SingleTaskGP`` of one output at one draw, by default the likeliest.
-
-        Mean, kernel and noise are the model's and are not learnt. A ValueError if there are several
-        outputs or missing targets.
-        """
-        if self.num_outputs > 1 or self.data.Y.isnan().any():
-            raise ValueError(
-                "Expected one output without missing targets; take model.subset_output([0]), and "
-                "leave out rows of NaN."
-            )
-        if draw is None:
-            density = self.log_likelihood(self.u)[0].sum(-1) - 0.5 * self.u.square().sum((-1, -2))
-            draw = int(density.argmax())
-        model = self.subset_draws(torch.tensor([draw])).requires_grad_(False)
-        noise = model.likelihood.noise.detach().reshape(self.data.Y.shape)
-        with validate_input_scaling(False):  # the model has units
-            return SingleTaskGP(
-                self.data.X, self.data.Y, noise, covar_module=model.covar_module,
-                mean_module=model.mean_module, outcome_transform=None, input_transform=None,
-            )  # fmt: skip
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({counted(self)})"

@@ -53,7 +53,6 @@ class Draws(NamedTuple):
 
     u: Tensor  # N x B x P
     log_evidence: Tensor  # of each half, 2 x B
-    effective: Tensor  # the number of starting draws that count, B
 
 
 @torch.no_grad()
@@ -103,7 +102,7 @@ def sample(
     evidence = like.new_zeros(GROUPS, shape[0])
     length = torch.full_like(power, _FIRST_LENGTH)
     problems = torch.arange(shape[0], device=like.device)
-    effective = None
+    is_first = True
     while True:
         # The highest power at which enough draws count.
         step = _step(value, power, least)
@@ -113,25 +112,25 @@ def sample(
         evidence = evidence + halves.logsumexp(1) - math.log(halves.shape[1])
         power = power + step
         weights = logs.softmax(0)
-        is_first = effective is None
-        if effective is None:
-            effective = weights.square().sum(0).reciprocal()
-            with_moves = with_moves and (start is None or bool((effective < number).any()))
+        if is_first and start is not None:
+            effective = weights.square().sum(0).reciprocal()  # number of draws that count
+            with_moves = with_moves and bool((effective < number).any())
         # Resample, and move.
         root = _root(u, weights, start)
         chosen = _resampled(halves, number // GROUPS, generator)
         u, value, slope = (part[chosen, problems] for part in (u, value, slope))
         if not with_moves:
-            return Draws(u, evidence, effective)
+            return Draws(u, evidence)
         if is_first:
             value, slope = ratio(u)
+            is_first = False
         is_done = bool((power >= 1).all())
         for _ in range(_LAST_MOVES if is_done else _MOVES):
             here = (u, value, slope)
             u, value, slope, rate = _move(ratio, begin, here, power, root, length, generator)
             length = length * (rate - _ACCEPTED).exp()
         if is_done:
-            return Draws(u, evidence, effective)
+            return Draws(u, evidence)
 
 
 def _move(

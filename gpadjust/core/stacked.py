@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import torch
 from torch import Size, Tensor
-from torch.nn import Module, ModuleList
+from torch.nn import ModuleList
 from torch.quasirandom import SobolEngine
 
 from gpadjust.checks import checked_whole
@@ -71,6 +71,14 @@ class Wrapper(Predictive):
     def of_models(self, models: Iterable[GP]) -> Self:
         """Return the same of other models with as many draws."""
         return deepcopy(self, {id(self.models): ModuleList(models)}).eval()
+
+    def sample_functions(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise an error: functions come from a GP alone."""
+        raise NotImplementedError(
+            f"A {type(self).__name__} cannot draw functions; draw joint samples, "
+            "posterior(X).rsample(), or functions of one of its models, as it is: "
+            "models[0].sample_functions(8)."
+        )
 
     def to(self, *args: Any, **options: Any) -> Self:
         """Move the models to a device, with their data."""
@@ -169,13 +177,6 @@ class StackedGP(Wrapper):
         new.owners, new.picks = self.owners[:, idcs], self.picks[:, idcs]
         return new
 
-    def sample_functions(
-        self, num_functions: int, seed: int | None = None, num_features: int = 1024
-    ) -> StackedFunctions:
-        """Draw functions ``... x q x d`` to ``k x ... x q x m``, in proportion to the weights."""
-        seed = int(torch.randint(2**31, ())) if seed is None else seed
-        return StackedFunctions(self, num_functions, num_features, seed)
-
     def summary(self) -> str:
         """Return the weights, and the summary of each model."""
         lines = [repr(self)]
@@ -190,46 +191,6 @@ class StackedGP(Wrapper):
     def _repr_html_(self) -> str:
         rows = [[name, *(f"{w:.0%}" for w in weights)] for name, weights in self.weights.items()]
         return html_table(repr(self), ["weights", *self.data.output_names], rows)
-
-
-class StackedFunctions(Module):
-    """Functions from a mixture, each output of one component; see :class:`Functions`."""
-
-    def __init__(self, model: StackedGP, number: int, num_features: int, seed: int) -> None:
-        super().__init__()
-        self.model, self.number = model, checked_whole("num_functions", number, 1)
-        order = torch.randperm(len(model.picks), generator=torch.Generator().manual_seed(seed))
-        order = order[torch.arange(number) % len(order)]
-        self.owners, picks = model.owners[order], model.picks[order]  # k x m
-        outputs = [[j] for j in range(model.num_outputs)]
-        if (picks == picks[:, :1]).all():  # all outputs of a component are of the same draw
-            outputs = [[*range(model.num_outputs)]]
-        self.parts: list[list[Any]] = [[] for _ in outputs]
-        for columns, parts in zip(outputs, self.parts, strict=True):
-            start, j = 0, columns[0]
-            for i, gp in enumerate(model.models):
-                rows = (self.owners[:, j] == i).nonzero().squeeze(-1)
-                if len(rows):
-                    part = gp.subset_draws(picks[rows, j] - start).subset_output(columns)
-                    part_seed = seed + j * len(model.models) + i
-                    functions = part.sample_functions(len(rows), part_seed, num_features)
-                    parts.append((rows, functions))
-                start += len(gp.u)
-
-    def forward(self, X: Tensor) -> Tensor:
-        """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
-        return self._side_by_side(lambda functions, rows: functions(X))
-
-    def evaluate_each(self, X: Tensor) -> Tensor:
-        """Return the values ``k x q x m`` of each function at other points, ``k x q x d``."""
-        return self._side_by_side(lambda functions, rows: functions.evaluate_each(X[rows]))
-
-    def _side_by_side(self, evaluate: Callable[[Any, Tensor], Tensor]) -> Tensor:
-        values = []
-        for parts in self.parts:
-            order = torch.cat([rows for rows, _ in parts]).argsort()
-            values.append(torch.cat([evaluate(f, rows) for rows, f in parts])[order])
-        return torch.cat(values, -1)
 
 
 def _check_models(models: Any) -> None:

@@ -11,8 +11,7 @@ from torch import Tensor
 from gpadjust.checks import checked_bounds, checked_whole
 from gpadjust.core import GP, KnownNoise, Noise, Row, Term
 from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, names_of, unit_of
-from gpadjust.core.gaussian import Marginals
-from gpadjust.core.kernels import Features, Kernel, PullBack
+from gpadjust.core.kernels import STANDARD_DEVIATION, Features, Kernel, PullBack
 from gpadjust.core.structures import DELTA_CONSTANT
 from gpadjust.core.terms import Places, as_kernel
 from gpadjust.core.unknowns import Values
@@ -107,13 +106,8 @@ class AR1(GP):
             return high
         return appended((self.low.Y.mT / self._low_unit()).to(high), high, -1)
 
-    def left_out(self) -> Marginals:
-        """Return the distribution of each target of the high level given all others."""
-        high = slice(len(self.low.X), None)
-        return Marginals(*(moment[..., high, :] for moment in super().left_out()))
-
-    def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means and variances of left-out targets of the high level, at coordinates."""
+    def left_out_at(self, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return means and variances of left-out targets of the high level."""
         high = slice(len(self.low.X), None)
         mean, variance = super().left_out_at(u)
         return mean[..., high, :], variance[..., high, :]
@@ -151,6 +145,21 @@ class AtLevels(Kernel):
         if self.has_rho:
             rows.append(Row("rho", one, 3.0))
         return rows
+
+    def in_user_units(self, name: str, numbers: Tensor, unit: float) -> tuple[str, Tensor]:
+        """Return the name and numbers of a parameter in summaries.
+
+        Standard deviations of the low level are shares of that of its values.
+        """
+        if self.has_rho:
+            unit = 1.0
+        if name == "constant":
+            shown, numbers = f"{STANDARD_DEVIATION} of the constant", numbers.sqrt() * unit
+        else:
+            shown, numbers = self.kernel.in_user_units(name, numbers, unit)
+        if self.has_rho:
+            shown = shown.replace(STANDARD_DEVIATION, f"{STANDARD_DEVIATION} over that of low_Y")
+        return shown, numbers
 
     def basis(self, own: Values, x: Tensor) -> Tensor:
         """Return b, ``... x S x m x n``."""

@@ -296,13 +296,6 @@ class Linked(GP):
         new.link = self.link.of_outputs(self.checked_outputs(idcs))
         return new
 
-    def as_single_task_gp(self, draw: int | None = None) -> Any:
-        """Raise a TypeError: BoTorch's SingleTaskGP has no link."""
-        raise TypeError(
-            f"{type(self).__name__} is Gaussian in {self.link.formula}, not in y: use its "
-            "posterior, samples or functions in place of a SingleTaskGP."
-        )
-
 
 @cache
 def linked(structure: Any) -> type[Linked]:

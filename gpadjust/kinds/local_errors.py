@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -74,13 +74,6 @@ class Widened(Wrapper):
         for name in self.numbers:
             setattr(new, name, getattr(self, name)[idcs])
         return new
-
-    def sample_functions(self, *_: Any, **__: Any) -> Any:
-        """Raise an error: functions come from a GP alone."""
-        raise NotImplementedError(
-            f"A {type(self).__name__} cannot draw functions; draw joint samples, "
-            "posterior(X).rsample(), or functions of its attribute model, without the factors."
-        )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.model!r})"

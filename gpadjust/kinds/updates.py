@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import Buffer
 
 from gpadjust.checks import checked_number, checked_whole
-from gpadjust.core import GP, Fourier, MixturePosterior
+from gpadjust.core import GP, Fourier
 from gpadjust.core.data import ArrayLike
 from gpadjust.core.gaussian import Marginals
 from gpadjust.core.terms import WeightedSum
@@ -138,10 +138,6 @@ class Kalman(Updated):
             self.weights = self.weights.moved_to(self.models[0])
             self.models[0] = self.models[0].with_conditioning(self.weights)
         return super().model
-
-    def term(self, name: str, X: ArrayLike) -> MixturePosterior:
-        """Return the joint posterior of a term's process at ``X``, as :meth:`GP.term` does."""
-        return self.model.term(name, X)
 
     def condition_on_observations(
         self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any

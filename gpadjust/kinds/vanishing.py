@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_finite, checked_columns
-from gpadjust.core.data import Data, as_tensor
+from gpadjust.core.data import Data
 from gpadjust.core.kernels import Features, Kernel
 from gpadjust.core.terms import Term, as_kernel
 from gpadjust.core.unknowns import LogNormal, Row, Values
@@ -33,11 +33,11 @@ class Vanishing(Kernel):
     Args:
         where: Values of columns, by name or number, in the user's units: ``{"valve": 1.0}``,
             ``{"valve": [0.0, 1.0]}`` for either, ``{"valve": 1.0, "flow": 0.0}`` for both at once.
-            Or points, ``p x d``, or a frame with some of the columns. For a category, the numbers
-            of its levels.
+            Or a frame with some of the columns. For a category, the numbers of its levels.
         kernel: k, of this library or GPyTorch. Default: RBF.
 
     Raises:
+        TypeError: If ``where`` is neither a dictionary nor a frame.
         ValueError: If ``where`` is empty, not finite or of another shape, a column does not exist,
             a transform of the inputs mixes columns, or k is not a product over S and R.
 
@@ -59,17 +59,11 @@ class Vanishing(Kernel):
         self.kernel: Any = kernel
         if hasattr(where, "columns"):
             where = {name: where[name].to_list() for name in where.columns}
-        self.is_points = not isinstance(where, Mapping)
-        if self.is_points:
-            if isinstance(where, list | tuple):
-                where = torch.tensor(where, dtype=torch.float64)
-            points = as_tensor(where, "where")
-            if points.dim() != 2:
-                raise ValueError(
-                    "Expected `where` as values of columns ({'valve': 1.0}) or as points p x d; "
-                    f"found shape {tuple(points.shape)}."
-                )
-            where = dict(enumerate(points.mT))
+        if not isinstance(where, Mapping):
+            raise TypeError(
+                "Expected `where` as values of columns, {'valve': 1.0}, or a frame with some of "
+                f"the columns; found {where!r}."
+            )
         try:
             columns = [torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in where.values()]
             self.values = torch.stack(torch.broadcast_tensors(*columns), -1)
@@ -88,8 +82,7 @@ class Vanishing(Kernel):
     def settings(self) -> dict[str, Any]:
         """The arguments."""
         by_column = dict(zip(self.columns, self.values.mT.tolist(), strict=True))
-        where = self.values.tolist() if self.is_points else by_column
-        return {"where": where, "kernel": self.kernel}
+        return {"where": by_column, "kernel": self.kernel}
 
     def of_term(self, outputscale: LogNormal) -> Vanishing:
         """Return the kernel for a term, whose prior variance is the default of k."""
@@ -101,11 +94,6 @@ class Vanishing(Kernel):
         """Return the kernel for a model's data, on the inputs of its kernels."""
         new = copy(self)
         d = data.X.shape[-1]
-        if self.is_points and len(self.columns) != d:
-            raise ValueError(
-                f"Expected `where` as points of {d} columns; found {len(self.columns)}. Give "
-                "values of some columns as a dictionary."
-            )
         places = data.X.new_full((len(self.values), d), torch.nan)
         columns = checked_columns("`where`", self.columns, data.input_names)
         places[:, columns] = self.values.to(places)

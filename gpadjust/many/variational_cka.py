@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NoReturn, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -135,11 +135,6 @@ class VariationalCKA(CKA):
         mean, K = self.term("delta", X).gaussians
         rest_mean, rest_K = self.term(_REST, X).gaussians
         return MixturePosterior(mean + rest_mean, K + rest_K)
-
-    def as_single_task_gp(self, draw: int | None = None) -> NoReturn:
-        """Raise an error: a ``SingleTaskGP`` is exact."""
-        way_out = "model.subset_rows(torch.arange(500)).as_single_task_gp()"
-        raise NotImplementedError(f"Expected an exact model; take one of some rows, {way_out}.")
 
     def fit_itself(self, method: str, num_draws: int | None, seed: int) -> FitResult | None:
         """Find the most likely numbers; after an error the model is as before."""

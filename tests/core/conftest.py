@@ -202,22 +202,19 @@ def give():
 
     def give(model, numbers):
         S = max(len(value) for value in numbers.values())
-        own = []
-        for row in model.table.own:
-            value = numbers.get(row.name)
-            if value is None:
-                own.append(row.location.new_zeros(S, *row.location.shape))
-                continue
-            if row.name.endswith(".center"):
-                middle, scale = _center(model, row.name)
+        u, values = model.u.detach().new_zeros(S, *model.u.shape[1:]), {}
+        for name in {row.name for row in model.table.own} & numbers.keys():
+            value = numbers[name]
+            if name.endswith(".center"):
+                middle, scale = _center(model, name)
                 value = (value - middle) / scale
-            elif row.name != "choice":
-                value = value / _size(model, row.name) - LEAST * row.name.startswith("noise")
-                value = (value.log() - row.location) / row.scale
-            own.append(value.expand(S, *row.location.shape))
-        u = [torch.cat(own, -1).reshape(S, model.table.problems, -1)] if own else []
-        shared = [numbers[row.name].unsqueeze(1) for row in model.table.shared]
-        model.set_draws(torch.cat([*u, *shared], -1))
+            elif name != "choice":
+                value = value / _size(model, name) - LEAST * name.startswith("noise")
+            values[name] = value
+        u = model.table.with_values(u, values)
+        for i, row in enumerate(reversed(model.table.shared)):
+            u[:, 0, -1 - i] = numbers[row.name][:, 0]
+        model.set_draws(u)
         return model.eval()
 
     return give
@@ -255,15 +252,12 @@ def alike(close):
 def same(close, alike):
     """Asserts that two models predict the same at `Z`: joint, one by one, and of each term."""
 
-    def same(a, b, Z, tolerance=1e-8, outputs=slice(None), noise=True):
-        assert [t.name for t in a.terms] == [t.name for t in b.terms]
-        alike(a.predict(Z), b.predict(Z), tolerance, outputs)
-        alike(a.predict(Z, noise), b.predict(Z, noise), tolerance, outputs)
-        alike(a.posterior(Z), b.posterior(Z), tolerance, outputs)
-        for name in [term.name for term in a.terms if term.varies]:
-            alike(a.term(name, Z), b.term(name, Z), tolerance, outputs)
-        if outputs == slice(None):
-            p, q = (m.posterior(Z).distribution.covariance_matrix for m in (a, b))
-            close(p, q, tolerance)
+    def same(a, b, Z, tolerance=1e-8, noise=True):
+        alike(a.predict(Z), b.predict(Z), tolerance)
+        alike(a.predict(Z, noise), b.predict(Z, noise), tolerance)
+        asks = [lambda m, name=t.name: m.term(name, Z) for t in a.terms if t.varies]
+        for ask in (lambda m: m.posterior(Z), *asks):
+            alike(ask(a), ask(b), tolerance)
+            close(ask(a).covariance_matrix, ask(b).covariance_matrix, tolerance)
 
     return same

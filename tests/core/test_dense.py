@@ -119,14 +119,6 @@ def test_means_and_a_center_are_in_the_users_units(data, drawn, formulas, unifor
     close(model.predict(far).mean, 1.5 * physics(far) - 70)
 
 
-@pytest.mark.parametrize("center", [False, True])
-def test_rho_times_physics_plus_delta_is_the_mean(center, data, drawn, uniform, close):
-    X, Y = data(num_outputs=2)
-    model = drawn(CKA(X, Y, physics=crude, center=center))
-    Z = uniform(2, 6, 2, low=-1.0, high=3.0, seed=4)
-    close(model.rho(Z).mean * crude(Z) + model.delta(Z).mean, model.posterior(Z).mean)
-
-
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
 def test_batches_of_inputs_are_predicted_apart(batch, data, drawn, uniform, close):
     X, Y = data(num_outputs=2)

@@ -9,7 +9,6 @@ import torch
 from gpadjust import core
 from gpadjust.core import CKA, GP, Choice, LogNormal, SamplingWarning, Term, ZeroMeanGP, fit
 from gpadjust.core.sample import around_mode
-from gpadjust.kinds import LinkedCKA, NoisyInputs, RelativeNoise
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests import systems
 from tests.systems import wave
@@ -92,30 +91,19 @@ def test_probabilities_of_nested_models(n):
     assert 1 - chosen == pytest.approx(result.probabilities["some"][0], abs=0.01)
 
 
-def noisy_inputs(X, Y):
-    noisy = NoisyInputs(X, 0.01**2)
-    return CKA(noisy.X, Y, physics=wave, noise=noisy)
-
-
-TWICE = {
-    "CKA": lambda X, Y: CKA(X, Y, physics=wave),
-    "RRA": lambda X, Y: core.RRA(X, Y, physics=wave, num_features=16),
-    "link": lambda X, Y: LinkedCKA(X, Y.exp(), physics=lambda X: wave(X).exp()),
-    "relative noise": lambda X, Y: ZeroMeanGP(X, Y, noise=RelativeNoise()),
-    "noisy inputs": noisy_inputs,
-}
-
-
-@pytest.mark.parametrize(("kind", "n"), [*((kind, 12) for kind in TWICE), ("CKA", 60)])
-def test_fitted_twice_is_fitted_once(kind, n):
+@pytest.mark.parametrize("n", [12, 60])
+def test_fitted_twice_is_fitted_once(n):
     X, e = noisy(n)
-    model = TWICE[kind](X, 1.3 * wave(X) + X[:, 1:] + e)
+    model = CKA(X, 1.3 * wave(X) + X[:, 1:] + e, physics=wave)
+    before = torch.random.get_rng_state()
     first = fit(model, seed=3)
+    assert torch.equal(before, torch.random.get_rng_state())
     once = model.predict(X)
     fit(model, "map")
     second = fit(model, seed=3)
     assert all(map(torch.equal, once, model.predict(X)))
     assert torch.equal(first.log_evidence, second.log_evidence)
+    assert not torch.equal(fit(model, seed=4).log_evidence, second.log_evidence)
 
 
 def test_the_approximation_of_a_normal_posterior_is_exact():
@@ -173,35 +161,27 @@ def test_a_law_that_is_right_is_as_likely_as_its_corrections():
     assert result.probabilities["as it is"][0] > 0.2
 
 
-def test_the_error_is_how_far_seeds_are_apart():
-    X, e = noisy(8)
-    model, means, variances, errors = ZeroMeanGP(X, wave(X) + e), [], [], []
-    for seed in range(20):
-        with warnings.catch_warnings(action="ignore", category=SamplingWarning):
-            errors.append(fit(model, num_draws=16, seed=seed).error)
-        mean, variance = model.left_out()
-        means.append(mean.mean(0))
-        variances.append(variance.mean(0) + mean.var(0, correction=0))
-    moved = torch.stack(means).var(0) / torch.stack(variances).mean(0)
-    error = torch.tensor(errors).square().mean().sqrt().item()
-    assert 0.5 < error / moved.mean().sqrt().item() < 2
-
-
 @pytest.mark.slow
-def test_the_error_of_parameters_is_how_far_seeds_are_apart():
+def test_the_error_is_how_far_seeds_are_apart():
     X, e = noisy(8)
     unknowns = {"a": Unknown(1.0, sd=0.5), "b": Unknown(0.0, sd=1.0)}
     law = FunctionPhysics(lambda X, p: p.a * wave(X)[:, 0] + p.b, unknowns=unknowns)
-    model, means, sds, errors = CKA(X, wave(X) + 0.3 + e, physics=law), [], [], []
+    model = core.PhysicsMeanGP(X, wave(X) + 0.3 + e, physics=law)
+    moments, parameters, errors = [], [], []
     for seed in range(20):
         with warnings.catch_warnings(action="ignore", category=SamplingWarning):
             result = fit(model, num_draws=16, seed=seed)
-        errors.append(result.parameter_error)
-        means.append(model.physics_parameters.mean)
-        sds.append(model.physics_parameters.sd)
-    moved = torch.stack(means).var(0).sqrt() / torch.stack(sds).mean(0)
-    error = torch.tensor(errors).square().mean().sqrt().item()
-    assert 0.5 < error / moved.max().item() < 2
+        errors.append([result.error, result.parameter_error])
+        mean, variance = model.left_out()
+        moments.append(torch.stack([mean.mean(0), variance.mean(0) + mean.var(0, correction=0)]))
+        found = model.physics_parameters
+        parameters.append(torch.stack([found.mean, found.sd]))
+    mean, variance = torch.stack(moments, 1)
+    moved = (mean.var(0) / variance.mean(0)).mean().sqrt()
+    mean, sd = torch.stack(parameters, 1)
+    moved = torch.stack([moved, (mean.var(0).sqrt() / sd.mean(0)).max()])
+    ratio = torch.tensor(errors).square().mean(0).sqrt() / moved
+    assert ((ratio > 0.5) & (ratio < 2)).all()
     assert f"move means of parameters by {result.parameter_error:.2f}." in str(result)
     assert math.isnan(fit(ZeroMeanGP(X, wave(X) + e), num_draws=16).parameter_error)
 
@@ -223,13 +203,6 @@ def test_evidence_of_targets_in_another_unit():
     assert (found[0] - found[1]).item() == pytest.approx(11 * math.log(1024.0), abs=1e-6)
 
 
-def test_the_generator_is_left_alone():
-    X, e = noisy(12)
-    before = torch.random.get_rng_state()
-    fit(CKA(X, wave(X) + e, physics=wave))
-    assert torch.equal(before, torch.random.get_rng_state())
-
-
 def test_it_shrinks_to_the_formula_or_leaves_it():
     X, e = noisy(15)
     Z, _ = noisy(200, seed=1)
@@ -245,25 +218,6 @@ def test_it_shrinks_to_the_formula_or_leaves_it():
     result = fit(useless)
     assert result.probabilities["of no use"][0] > 0.5
     assert "of no use 0." in str(result) or "of no use 1." in str(result)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("n", "noise"), [(256, 0.0), (100, 0.05)])
-def test_convergence_is_judged_by_predictions(n, noise):
-    """Exact data of many points raise no alarm, and seeds agree as far as they are said to."""
-    X, e = noisy(n, noise=noise)
-    Z, _ = noisy(100, seed=1)
-    Y = 1.3 * wave(X) * (1 + X[:, 1:]) + 0.3 * X[:, :1] + e
-    means, errors = [], []
-    for seed in range(3):
-        model = CKA(X, Y, physics=lambda X: wave(X) * (1 + X[..., 1:]))
-        with warnings.catch_warnings(action="error"):
-            result = fit(model, seed=seed)
-        assert result.converged
-        means.append(model.predict(Z).mean)
-        errors.append(result.error)
-    moved = torch.stack(means).std(0) / model.predict(Z).variance.sqrt()
-    assert moved.square().mean().sqrt() < max(0.35, 4 * max(errors))
 
 
 @pytest.mark.slow

@@ -8,18 +8,15 @@ from botorch.acquisition.multi_objective.logei import qLogNoisyExpectedHypervolu
 from botorch.fit import fit_gpytorch_mll
 from botorch.generation import MaxPosteriorSampling
 from botorch.models import ModelListGP, SingleTaskGP
-from botorch.models.transforms import Normalize, Standardize
 from botorch.optim import optimize_acqf
 from botorch.sampling import SobolQMCNormalSampler
 from botorch.sampling.pathwise import draw_matheron_paths, get_matheron_path_model
 from gpytorch.kernels import RBFKernel, ScaleKernel
 from gpytorch.mlls import ExactMarginalLogLikelihood, SumMarginalLogLikelihood
 
-from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, fit
+from gpadjust.core import CKA, PhysicsMeanGP, fit
 from gpadjust.gpytorch import PhysicsMean, PhysicsScaledKernel
-from gpadjust.kinds import LinkedCKA
-from gpadjust.physics import FunctionPhysics, Unknown
-from tests.systems import line, normal, same, uniform, wave
+from tests.systems import normal, same, uniform, wave
 
 BOUNDS = torch.tensor([[0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
 SEARCH = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5}}
@@ -62,9 +59,9 @@ def test_three_ways_to_the_most_likely_numbers(data):
     optimizer = torch.optim.Adam([p for p in by_adam.parameters() if p.requires_grad], lr=0.1)
     for _ in range(200):
         optimizer.zero_grad()
-        value = loss(by_adam)
-        value.backward()
+        loss(by_adam).backward()
         optimizer.step()
+    assert torch.equal(by_adam.draws, by_adam.u)
     fit_gpytorch_mll(ExactMarginalLogLikelihood(by_mll.likelihood, by_mll))
     fit(by_fit, "map")
     best = loss(by_fit).item()
@@ -72,21 +69,21 @@ def test_three_ways_to_the_most_likely_numbers(data):
     assert best < loss(by_mll).item() + 1e-5
     Z = uniform(5, 2, seed=3)
     observed = by_adam.eval().likelihood(by_adam(Z))
-    expected = by_adam.predict(Z, observation_noise=True)
-    torch.testing.assert_close(observed.mean.unsqueeze(-1), expected.mean)
-    torch.testing.assert_close(observed.variance.unsqueeze(-1), expected.variance)
+    expected = [v[:, 0] for v in by_adam.predict(Z, observation_noise=True)]
+    same((observed.mean, observed.variance), expected)
 
 
-def test_the_loss_is_the_density_and_differentiable(data):
+@pytest.mark.parametrize("Yvar", [None, 0.01])
+def test_the_loss_is_the_density_and_differentiable(data, Yvar):
     X, Y = data
     Y[3, 1] = torch.nan
-    for model in (CKA(X, Y, physics=both), CKA(X, Y, 0.01, physics=both)):
-        with torch.no_grad():
-            model.u += 0.3 * torch.randn(model.u.shape, dtype=torch.float64)
-        value = -loss(model).sum() * len(X)
-        (slope,) = torch.autograd.grad(value, model.u)
-        _, expected = model.log_likelihood(model.u.detach())
-        torch.testing.assert_close(slope, expected - model.u.detach(), rtol=1e-6, atol=1e-6)
+    model = CKA(X, Y, Yvar, physics=both)
+    with torch.no_grad():
+        model.u += 0.3 * torch.randn(model.u.shape, dtype=torch.float64)
+    value = -loss(model).sum() * len(X)
+    (slope,) = torch.autograd.grad(value, model.u)
+    _, expected = model.log_likelihood(model.u.detach())
+    torch.testing.assert_close(slope, expected - model.u.detach(), rtol=1e-6, atol=1e-6)
 
 
 def test_lists_of_models(data):
@@ -94,84 +91,45 @@ def test_lists_of_models(data):
     ours, theirs = CKA(X, Y[:, :1], physics=wave), SingleTaskGP(X, Y[:, 1:])
     both_models = ModelListGP(ours, theirs)
     fit_gpytorch_mll(SumMarginalLogLikelihood(both_models.likelihood, both_models))
+    fit(ours, num_draws=16)
     Z = uniform(5, 2, seed=3)
     posterior = both_models.posterior(Z)
-    torch.testing.assert_close(posterior.mean[:, :1], ours.predict(Z).mean)
+    same((posterior.mean[:, :1], posterior.variance[:, :1]), ours.predict(Z))
     assert posterior.rsample(torch.Size([3])).shape == (3, 5, 2)
-    fit(ours)
-    torch.testing.assert_close(both_models.posterior(Z).variance[:, :1], ours.predict(Z).variance)
     plain = ModelListGP(ours, CKA(X, Y[:, 1:], physics=lambda X: X[:, 1:]))
     later = plain.condition_on_observations([Z, Z], uniform(5, 2, seed=4))
     assert later.posterior(Z).mean.shape == (5, 2)
 
 
-def test_a_link_and_other_models_in_a_list():
-    """After the default fit, by which a linked posterior once had a dimension for draws."""
-    X, Z = line(12), uniform(5, 1, seed=3)
-    Y = 1.3 * wave(X) + X + 0.05 * normal(12, 1)
-    linked = LinkedCKA(X, Y.exp(), physics=lambda X: wave(X).exp())
-    plain = CKA(X, Y, physics=wave)
-    for each in (linked, plain):
-        fit(each, num_draws=16)
-    for models in ([linked, plain], [SingleTaskGP(X, Y), linked]):
-        posterior = ModelListGP(*models).posterior(Z)
-        assert posterior.rsample(torch.Size([4])).shape == (4, 5, 2)
-        same(posterior.mean.unbind(-1), [m.posterior(Z).mean[:, 0] for m in models])
-
-
 def test_state(data, models):
     X, Y = data
     Z = uniform(5, 2, seed=3)
-    for model, (columns, physics) in zip(models, (([0], wave), ([0, 1], both)), strict=True):
-        again = CKA(X, Y[:, columns], physics=physics)
-        again.load_state_dict(model.state_dict())
-        assert torch.equal(again.predict(Z).variance, model.predict(Z).variance)
-    for j in range(2):
-        part = models[1].subset_output([j]).predict(Z)
-        torch.testing.assert_close(part.mean, models[1].predict(Z).mean[:, [j]])
+    again = CKA(X, Y, physics=both)
+    again.load_state_dict(models[1].state_dict())
+    assert torch.equal(again.predict(Z).variance, models[1].predict(Z).variance)
 
 
-def test_transforms(data):
-    X, Y = data
-    Z = uniform(5, 2, seed=3)
-    plain = CKA(X, Y, physics=both)
-    options = {"input_transform": Normalize(2), "outcome_transform": Standardize(2)}
-    other = CKA(X, Y, physics=both, **options)
-    # Lengthscales have medians like the ranges of what the kernels see.
-    torch.testing.assert_close(other.predict(Z).mean, plain.predict(Z).mean)
-    torch.testing.assert_close(other.posterior(Z).variance, plain.posterior(Z).variance)
-
-
-@pytest.mark.parametrize("name", ["LogEI", "UCB", "qLogEI", "qLogNEI", "qKG", "qLogNEHVI"])
+@pytest.mark.parametrize("name", ["LogEI", "qLogEI", "qLogNEI", "qKG", "qLogNEHVI"])
 def test_acquisition(models, data, name):
     X, Y = data
     one, two = models
     sampler, best = SobolQMCNormalSampler(torch.Size([16])), Y[:, 0].max()
     function = {
         "LogEI": lambda: acquisition.LogExpectedImprovement(one, best),
-        "UCB": lambda: acquisition.UpperConfidenceBound(one, 2.0),
         "qLogEI": lambda: acquisition.qLogExpectedImprovement(one, best, sampler=sampler),
         "qLogNEI": lambda: acquisition.qLogNoisyExpectedImprovement(one, X, sampler=sampler),
         "qKG": lambda: acquisition.qKnowledgeGradient(one, num_fantasies=4),
         "qLogNEHVI": lambda: qLogNoisyExpectedHypervolumeImprovement(
-            two, ref_point=[0.0, 0.0], X_baseline=X, sampler=sampler
+            two.subset_draws(torch.arange(len(two.u))[:8]),
+            ref_point=[0.0, 0.0],
+            X_baseline=X,
+            sampler=sampler,
         ),
     }[name]()
     q = 2 if name.startswith("q") else 1
     candidates, value = optimize_acqf(function, BOUNDS, q=q, **SEARCH)
     assert candidates.shape == (q, 2)
     assert value.isfinite().all()
-
-
-def test_a_physics_without_kernels_is_fitted_by_its_marginal_likelihood(data):
-    X, Y = data
-    gain = {"gain": Unknown(1.0, sd=1.0)}
-    physics = FunctionPhysics(lambda X, p: p.gain.unsqueeze(-1) * wave(X), unknowns=gain)
-    by_mll, by_map = (CalibratedPhysics(X, Y[:, :1], physics=physics) for _ in range(2))
-    assert not by_mll.covar_module(X).to_dense().any()
-    fit_gpytorch_mll(ExactMarginalLogLikelihood(by_mll.likelihood, by_mll))
-    fit(by_map, "map")
-    torch.testing.assert_close(by_mll.u.detach(), by_map.u.detach(), rtol=1e-3, atol=1e-3)
 
 
 def test_thompson_samples_and_paths(models):
@@ -190,16 +148,14 @@ def test_it_reads_as_a_gpytorch_model(models):
     for model, physics in zip(models, (wave, both), strict=True):
         S, m = len(model.u), model.num_outputs
         lead = [size for size in (S, m) if size > 1]
-        expected = physics(Z).mT.expand(S, m, 5)
-        prior = model.forward(Z)
         if not model.values.get("rho.mean", torch.zeros(1)).any():  # no draw without physics
+            expected = physics(Z).mT.expand(S, m, 5)
             torch.testing.assert_close(model.mean_module(Z), expected.reshape(*lead, 5))
         K = model.covar_module(Z).to_dense()
         assert K.shape == (*lead, 5, 5)
-        torch.testing.assert_close(prior.covariance_matrix, K)
+        torch.testing.assert_close(model.forward(Z).covariance_matrix, K)
         diagonal = model.covar_module(Z, diag=True)
         torch.testing.assert_close(diagonal, K.diagonal(dim1=-1, dim2=-2))
-        assert len(model.covar_module.kernels) == 2
         # rho's part of equation 2 is the kernel of rho, scaled by f_p - c on both sides.
         values = model.values
         f = physics(Z).mT - model.term_sum.center(model.terms[0], values) * model.unit
@@ -208,10 +164,6 @@ def test_it_reads_as_a_gpytorch_model(models):
         k = (k + values["rho.constant"].unsqueeze(-1)) * f.unsqueeze(-1) * f.unsqueeze(-2)
         rho = model.covar_module.kernels[0](Z).to_dense()
         torch.testing.assert_close(rho, k.reshape(rho.shape))
-    model = models[0]
-    if len(model.u) == 1:
-        grad = torch.autograd.grad(model.covar_module(Z).to_dense().sum(), model.u)[0]
-        assert grad.abs().sum() > 0
 
 
 class OwnCKA(gpytorch.models.ExactGP):
@@ -247,19 +199,6 @@ def test_an_exact_gp_of_ones_own_is_cka(data):
         torch.testing.assert_close(posterior.mean, expected.mean[:, 0], rtol=1e-10, atol=1e-10)
         variance = posterior.variance
     torch.testing.assert_close(variance, expected.variance[:, 0], rtol=1e-8, atol=1e-10)
-
-
-def test_as_single_task_gp(models):
-    Z = uniform(5, 2, seed=3)
-    model = models[0]
-    for draw in (None, len(model.u) - 1):
-        single = model.as_single_task_gp(draw)
-        assert isinstance(single, SingleTaskGP)
-        if draw is not None:
-            expected = model.subset_draws(torch.tensor([draw])).predict(Z)
-            found = single.posterior(Z)
-            torch.testing.assert_close(found.mean, expected.mean)
-            torch.testing.assert_close(found.variance, expected.variance, rtol=1e-4, atol=1e-7)
 
 
 def test_a_fitted_model_is_a_physics_by_its_predictions():

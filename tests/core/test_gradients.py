@@ -2,8 +2,6 @@
 
 import pytest
 import torch
-from gpytorch.kernels import LinearKernel, MaternKernel, PeriodicKernel, RBFKernel, ScaleKernel
-from gpytorch.priors import GammaPrior
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,18 +10,6 @@ from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, Stationary
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.core.noises import Relative
 from tests.systems import crude, normal, same, slopes, truth, uniform
-
-
-class Own(core.Kernel):
-    """A rational quadratic kernel, without derivatives by hand."""
-
-    def rows(self, x, num_outputs):
-        return [core.Row.positive("size", x.new_ones(num_outputs, 1), 2.0)]
-
-    def covariance(self, own, x, other=None):
-        other = x if other is None else other
-        squares = (x.unsqueeze(-2) - other.unsqueeze(-3)).square().sum(-1)
-        return 1 / (1 + squares / own["size"].unsqueeze(-1))
 
 
 def law(X, p):
@@ -44,36 +30,18 @@ def of(cls, *Yvar, **options):
     return lambda X, Y: cls(X, Y, *Yvar, **options)
 
 
-def delta(kernel):
-    return of(CKA, physics=crude, delta_covar_module=kernel, nested=False)
-
-
 UNKNOWN = known({})
 OTHER = FunctionPhysics(second, unknowns=UNKNOWN.unknowns)
 BOUNDED = known({"w": Unknown(3.0, bounds=(2.0, 4.0))})
 MODELS = {
-    "CKA": of(CKA, physics=crude),
-    "RRA": of(RRA, physics=crude, num_features=12),
     "PhysicsMeanGP, known noise": of(core.PhysicsMeanGP, 0.01, physics=crude),
-    "ScaleGP": of(core.ScaleGP, physics=crude),
-    "ZeroMeanGP": of(core.ZeroMeanGP),
     "two physics": of(CKA, physics=[crude, lambda X: crude(X).sin()], rho_mean=[0.7, 0.1]),
     "given numbers": of(CKA, physics=crude, center=0.7, rho_mean=1.5, delta_mean=-2.0),
     "no constants": of(CKA, physics=crude, constants=False, center=False),
-    "unknown parameters": of(CKA, physics=UNKNOWN),
     "two physics with the same parameters": of(CKA, physics=[UNKNOWN, OTHER]),
     "known and unknown": of(CKA, physics=[crude, BOUNDED]),
-    "calibrated": of(core.CalibratedPhysics, physics=UNKNOWN),
     "calibrated, known noise": of(core.CalibratedPhysics, 0.01, physics=UNKNOWN),
-    "relative noise": of(CKA, physics=crude, noise=Relative()),
     "relative noise of unknown parameters": of(CKA, physics=UNKNOWN, noise=Relative()),
-    "Matern 1/2": delta(Stationary(MATERN12)),
-    "Matern 3/2": delta(Stationary(MATERN32)),
-    "Matern 5/2": delta(Stationary(MATERN52)),
-    "own kernel": delta(Own()),
-    "GPyTorch": delta(ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=2)) + PeriodicKernel()),
-    "GPyTorch, product": delta(RBFKernel(active_dims=[0]) * LinearKernel()),
-    "GPyTorch, prior": delta(ScaleKernel(RBFKernel(lengthscale_prior=GammaPrior(3.0, 6.0)))),
 }
 
 
@@ -103,54 +71,6 @@ def test_every_model(name):
     model = MODELS[name](*problem())
     for choice in range(max(1, len(model.table.choices))):
         assert_right(model, coordinates(model, choice=choice))
-
-
-@settings(max_examples=15, derandomize=True)
-@given(st.integers(0, 2**31), st.sampled_from(list(MODELS)), st.integers(0, 2))
-def test_rows_in_another_order(seed, name, choice):
-    X, Y = problem(seed)
-    order = torch.randperm(len(X), generator=torch.Generator().manual_seed(seed))
-    one, other = MODELS[name](X, Y), MODELS[name](X[order], Y[order])
-    u = coordinates(one, seed, choice)
-    value, gradient = one.log_likelihood(u)
-    torch.testing.assert_close(other.log_likelihood(u)[0], value, rtol=1e-7, atol=1e-7)
-    size = gradient.abs().max().item()
-    torch.testing.assert_close(other.log_likelihood(u)[1], gradient, rtol=1e-6, atol=1e-6 * size)
-    Z = uniform(4, 2, seed=seed)
-    for model in (one, other):
-        model.set_draws(u)
-    for ask in (lambda model: model.predict(Z), lambda model: model.predict(Z, True)):
-        torch.testing.assert_close(ask(one), ask(other), rtol=1e-6, atol=1e-8)
-    torch.testing.assert_close(
-        [v[:, order].nan_to_num() for v in one.left_out()],
-        [v.nan_to_num() for v in other.left_out()],
-        rtol=1e-6,
-        atol=1e-8,
-    )  # fmt: skip
-
-
-APART = [name for name in MODELS if "unknown" not in name and "calibrated" not in name]
-APART.remove("two physics with the same parameters")
-
-
-@settings(max_examples=10, derandomize=True)
-@given(st.integers(0, 2**31), st.sampled_from(APART), st.integers(0, 2))
-def test_outputs_are_independent(seed, name, choice):
-    X, Y = problem(seed)
-    Y[:, 1].nan_to_num_(5.0)
-    one, other = (
-        MODELS[name](X, torch.stack([Y[:, 0], y], -1)) for y in (Y[:, 1], Y[:, 1].flip(0))
-    )
-    u = coordinates(one, seed, choice)
-    found = []
-    for model in (one, other):
-        model.set_draws(u)
-        value, gradient = model.log_likelihood(u)
-        predicted = torch.cat([*model.predict(X[:3])])
-        found.append((value[:, 0], gradient[:, 0], predicted[:, 0]))
-        assert value[:, 1].isfinite().all()
-    torch.testing.assert_close(*found, rtol=1e-9, atol=1e-9)
-    assert not torch.allclose(one.predict(X).mean[:, 1], other.predict(X).mean[:, 1])
 
 
 OFFSETS = st.floats(-1e4, 1e4) | st.sampled_from([1.0, 1e4, 1e8])
@@ -187,14 +107,12 @@ def test_near_duplicate_inputs(profile, gap):
     assert_right(model, coordinates(model), 1e-4)
 
 
-def test_gradients_of_predictions(gradient_is_right):
+def test_gradients_of_parts_and_functions(gradient_is_right):
     X, Y = problem()
-    model = MODELS["CKA"](X, Y)
+    model = CKA(X, Y, physics=crude)
     model.set_draws(torch.cat([coordinates(model, choice=k) for k in range(3)]))
     functions = model.sample_functions(3, seed=0)
     for ask in (
-        lambda Z: model.predict(Z).mean[..., 0].sum(),
-        lambda Z: model.predict(Z).variance[..., 1].sum(),
         lambda Z: model.posterior(Z).distribution.covariance_matrix[0, 1],
         lambda Z: model.rho(Z).mean.sum(),
         lambda Z: model.delta(Z).variance.sum(),

@@ -12,18 +12,9 @@ from tests.systems import line, normal
 
 def power(factor=10.0):
     X = 1.3 + 0.3 * line(8)
-    noise = normal(*X.shape)
     unknowns = {name: Unknown(1.0, factor=factor) for name in ("a", "b")}
     physics = FormulaPhysics("a * x**(5 * b)", ["x"], unknowns=unknowns)
-    return CalibratedPhysics(X, 0.7 * X**3.8 + 0.01 * noise, physics=physics)
-
-
-def test_a_physics_that_fails_is_impossible_with_and_without_a_gradient():
-    model = power()
-    u = torch.zeros_like(model.u)
-    u[..., -1] = 3.5  # x to the power of 16,000
-    assert model.log_likelihood(u, False)[0].item() == -torch.inf
-    assert model.log_likelihood(u)[0].item() == -torch.inf
+    return CalibratedPhysics(X, 0.7 * X**3.8 + 0.01 * normal(*X.shape), physics=physics)
 
 
 @pytest.mark.parametrize("method", ["bayes", "map"])
@@ -47,30 +38,19 @@ def beam(X, p):
     return 10 * X[:, 0] * (X[:, 1] ** 3 / (3 * p.EI) + X[:, 1] ** 2 / p.kr)
 
 
-def enzyme(X, p):
-    return p.V * X[:, 0] / (p.K + X[:, 0])
-
-
 def growth(X, p):
     return p.K / (1 + (p.K / 0.2 - 1) * torch.exp(-p.r * X[:, 0]))
-
-
-def drag(X, p):
-    limit = torch.sqrt(9.81 * p.m / p.c)
-    return limit * torch.tanh(9.81 * X[:, 0] / limit)
 
 
 # A formula, guesses and factors of its parameters, the box of the inputs, points, sd of the noise.
 PROBLEMS = {
     "beam": (beam, {"EI": (8.0, 1.6), "kr": (25.0, 1.6)}, [[0.3, 0.8], [1.0, 1.1]], 14, 0.01),
-    "enzyme": (enzyme, {"V": (3.0, 2.0), "K": (2.0, 2.0)}, [[0.1], [1.5]], 12, 0.02),
     "growth": (growth, {"r": (1.0, 1.4), "K": (5.0, 2.0)}, [[0.0], [3.5]], 13, 0.03),
-    "drag": (drag, {"m": (80.0, 1.3), "c": (0.4, 1.8)}, [[0.5], [6.0]], 12, 0.5),
 }
 
 
 def case(name, seed):
-    """Inputs, targets, physics and true parameters, which are drawn from the prior."""
+    """Inputs, targets and physics, with true parameters that are drawn from the prior."""
     law, priors, box, n, noise = PROBLEMS[name]
     generator = torch.Generator().manual_seed(77_000 + seed)
     options = {"generator": generator, "dtype": torch.float64}
@@ -79,7 +59,7 @@ def case(name, seed):
     unknowns = {key: Unknown(guess, factor=factor) for key, (guess, factor) in priors.items()}
     physics = FunctionPhysics(law, unknowns=unknowns)
     true = physics.unknowns.to_values(torch.randn(2, **options))
-    return X, physics(X, true) + noise * torch.randn(n, 1, **options), physics, true
+    return X, physics(X, true) + noise * torch.randn(n, 1, **options), physics
 
 
 def by_grid(X, Y, physics, variance):
@@ -102,7 +82,7 @@ def by_grid(X, Y, physics, variance):
 def test_intervals_are_those_of_a_grid(name):
     variance, ratios, away = PROBLEMS[name][-1] ** 2, [], []
     for seed in range(3):
-        X, Y, physics, _ = case(name, seed)
+        X, Y, physics = case(name, seed)
         model = CalibratedPhysics(X, Y, variance, physics=physics)
         fit(model)
         found = torch.stack(model.physics_parameters.interval())
@@ -112,40 +92,6 @@ def test_intervals_are_those_of_a_grid(name):
         away.append((found - exact).abs() / width)
     assert 0.9 < torch.stack(ratios).log().mean().exp() < 1.15
     assert torch.stack(away).mean() < 0.12
-
-
-@pytest.mark.slow
-def test_intervals_hold():
-    held = []
-    for name in PROBLEMS:
-        for seed in range(12):
-            X, Y, physics, true = case(name, seed)
-            model = CalibratedPhysics(X, Y, physics=physics)
-            fit(model)
-            low, high = model.physics_parameters.interval()
-            held.append((low <= true) & (true <= high))
-    assert 0.9 <= torch.stack(held).double().mean() <= 0.99
-
-
-def fold(law, unknowns, seed, noise=0.1):
-    """A model of a law of one input, whose true parameters are drawn from the prior, and these."""
-    X = line(12, 0.1, 2.0)
-    physics = FunctionPhysics(law, unknowns=unknowns)
-    true = physics.unknowns.to_values(normal(len(unknowns), seed=seed))
-    Y = physics(X, true) + noise * normal(len(X), 1, seed=100 + seed)
-    return CalibratedPhysics(X, Y, noise**2, physics=physics), true
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_optima_of_either_sign_are_found(seed):
-    """Of a swing that may have either sign, with the phase of the other."""
-    unknowns = {"swing": Unknown(0.0, sd=1.0), "phase": Unknown(0.0, bounds=(-3.15, 3.15))}
-    model, true = fold(lambda X, p: p.swing * torch.sin(3 * X[:, 0] + p.phase), unknowns, seed)
-    fit(model)
-    swing = model.physics_parameters["swing"]
-    assert 0.3 < (swing > 0).double().mean() < 0.7
-    assert abs(swing.abs().mean() - true[0].abs()) < 0.1
 
 
 @pytest.mark.slow
@@ -228,6 +174,9 @@ def test_coordinates_beyond_a_fold_are_missed():
 
 
 def test_where_the_physics_fails_there_is_no_density():
-    _, map_ = straight(lambda X, p: torch.log(p.p0) * X[:, 0], 1)
+    model, map_ = straight(lambda X, p: torch.log(p.p0) * X[:, 0], 1)
     value, _ = map_(torch.full((3, 1, 1), -50.0, dtype=torch.float64))
     assert (value == -torch.inf).all()
+    u = torch.full_like(model.u.detach(), -9.0)
+    for with_gradient in (False, True):
+        assert model.log_likelihood(u, with_gradient)[0].item() == -torch.inf

@@ -8,36 +8,18 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info
 
-from gpadjust.core import CKA, RRA, StackedGP, ZeroMeanGP, fit
-from gpadjust.kinds import AR1, LinkedCKA
+from gpadjust.core import CKA, fit
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.threads import threads_for
 from tests.systems import ripple, same, uniform
 
 
-def stacked(X, Y, physics):
-    models = {"CKA": CKA(X, Y, physics=physics), "zero mean": ZeroMeanGP(X, Y)}
-    return StackedGP(models, [0.5, 0.5], num_components=4)
-
-
-MODELS = {
-    "CKA": CKA,
-    "RRA": lambda *data, physics: RRA(*data, physics=physics, num_features=16),
-    "LinkedCKA": LinkedCKA,
-    "AR1": lambda *data, physics: AR1(*data, physics=physics, bounds=[[0, 0], [1, 1]], num_low=8),
-    "StackedGP": stacked,
-}
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_conditioning_leaves_the_model_whole_also_in_another_thread(name, drawn):
+def test_conditioning_leaves_the_model_whole_also_in_another_thread(drawn):
     def first(X):
         return ripple(X)[..., :1]
 
     X = uniform(9, 2)
-    model = MODELS[name](X, 1.2 * first(X) + X[:, 1:], physics=first)
-    for part in getattr(model, "models", [model]):
-        drawn(part)
+    model = drawn(CKA(X, 1.2 * first(X) + X[:, 1:], physics=first))
     Z, more = uniform(6, 2, seed=1), uniform(2, 2, seed=5)
     observed = first(more)
     done = Event()

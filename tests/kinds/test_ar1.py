@@ -1,19 +1,23 @@
 """AR1 as joint co-kriging of two levels."""
 
+from itertools import product
+
 import pytest
 import torch
 from botorch.models.transforms import Normalize
+from gpytorch.kernels import MaternKernel, ScaleKernel
 
-from gpadjust.core import MATERN52, Stationary, fit
+from gpadjust.core import MATERN52, Stationary
 from gpadjust.core.data import unit_of
 from gpadjust.kinds.ar1 import AR1
 from gpadjust.physics import FunctionPhysics, Unknown
-from tests.systems import crude, drawn, line, refused, uniform
+from tests.systems import crude, drawn, refused, uniform
 
 X, LOW_X, Z = (uniform(n, 2, high=2.0, seed=n) for n in (7, 11, 5))
 LOW_Y = crude(LOW_X)
 Y = 1.7 * crude(X) + X.sum(-1, keepdim=True).sin()
 BOUNDS = torch.tensor([[-3.0, 1.0], [-2.0, 5.0]], dtype=torch.float64)
+UNKNOWN = FunctionPhysics(lambda X, p: crude(X), unknowns={"w": Unknown(1.0, sd=1.0)})
 
 
 class Dense:
@@ -70,43 +74,27 @@ class Dense:
 @pytest.mark.parametrize("Yvar", [None, 0.02])
 def test_joint_co_kriging(Yvar, close):
     model = drawn(AR1(X, Y, Yvar, low_X=LOW_X, low_Y=LOW_Y))
-    parts = [[Dense(model, s, j, Yvar) for j in range(2)] for s in range(2)]
     means, K = model.posterior(Z).gaussians
     noisy, left_out = model.marginals(Z, observation_noise=True), model.left_out()
     assert left_out.means.shape == (2, 7, 2)
     ratio = model.log_likelihood(model.u.detach())[0]
-    for s in range(2):
-        for j, part in enumerate(parts[s]):
-            mean, covariance = part.posterior(Z)
-            close(means[s, j], mean, 1e-6)
-            close(K[s, j], covariance, 1e-6)
-            expected = covariance.diagonal() + part.high_noise[0]
-            close(noisy.variances[s, :, j], expected, 1e-6)
-            rows = torch.arange(18) != 13  # without the third observation of the high level
-            mean, covariance = part.posterior(X[[2]], rows)
-            close(left_out.means[s, 2, [j]], mean, 1e-6)
-            close(left_out.variances[s, 2, [j]], covariance[0] + part.high_noise[2], 1e-6)
+    expected = torch.zeros_like(ratio)
+    for s, j in product(range(2), repeat=2):
+        part = Dense(model, s, j, Yvar)
+        mean, covariance = part.posterior(Z)
+        close(means[s, j], mean, 1e-6)
+        close(K[s, j], covariance, 1e-6)
+        close(noisy.variances[s, :, j], covariance.diagonal() + part.high_noise[0], 1e-6)
+        rows = torch.arange(18) != 13  # without the third observation of the high level
+        mean, covariance = part.posterior(X[[2]], rows)
+        close(left_out.means[s, 2, [j]], mean, 1e-6)
+        close(left_out.variances[s, 2, [j]], covariance[0] + part.high_noise[2], 1e-6)
+        expected[s, j] = part.log_likelihood()
+    close(ratio[1] - ratio[0], expected[1] - expected[0], 1e-6)  # but for the units
     for ours, at in zip(left_out, model.left_out_at(model.u.detach()), strict=True):
         close(ours, at)
     more = model.condition_on_observations(Z, crude(Z), None if Yvar is None else 0.02 + 0 * Z)
     assert more.left_out().means.shape[-2] == 12  # of the high level
-    own = torch.tensor([[p.log_likelihood() for p in row] for row in parts])
-    close((ratio[1] - ratio[0]).squeeze(), own[1] - own[0], 1e-6)  # but for the units
-
-
-def test_recursive_co_kriging_on_nested_designs_without_noise(close):
-    """The recursion of Le Gratiet and Garnier (2014) is the joint model then."""
-    model = AR1(LOW_X[:6], 1.7 * LOW_Y[:6] + LOW_X[:6].sin(), 1e-12, low_X=LOW_X, low_Y=LOW_Y)
-    values = {row.name: 0.0 for row in model.table.own}
-    values |= {f"{name}.kernel.lengthscale": -1.0 for name in ("low", "delta")}  # 0.5
-    u = torch.cat([torch.full_like(r.location, values[r.name]) for r in model.table.own], -1)
-    model.set_draws(u.reshape(model.u.shape))
-    part = Dense(model.eval(), 0, 0, 1e-12)
-    k1, k2, rho, y1, x2 = part.k1, part.k2, part.rho, LOW_Y[:, 0], LOW_X[:6]
-    exact = part.noise[:11].diag()
-    first = k1(Z, LOW_X) @ torch.linalg.solve(k1(LOW_X, LOW_X) + exact, y1)
-    bias = k2(Z, x2) @ torch.linalg.solve(k2(x2, x2), model.data.Y[:, 0] - rho * y1[:6])
-    close(model.predict(Z).mean[:, 0], rho * first + bias, 1e-4)
 
 
 def test_low_values_may_be_missing_or_the_physics():
@@ -115,13 +103,10 @@ def test_low_values_may_be_missing_or_the_physics():
     torch.testing.assert_close(given.predict(Z).mean, computed.predict(Z).mean)
     missing = LOW_Y.clone()
     missing[0, 1] = torch.nan
-    two = AR1(X, Y, low_X=LOW_X, low_Y=missing).eval()
-    kernel = {"low_covar_module": Stationary(MATERN52), "input_transform": Normalize(2)}
-    one = AR1(X, Y[:, 1:], low_X=LOW_X[1:], low_Y=LOW_Y[1:, 1:]).eval()
-    for name, v in one.values.items():
-        same = two.values[name][:, 1:]
-        assert name.endswith("lengthscale") or torch.equal(v, same)
+    two = AR1(X, Y, low_X=LOW_X, low_Y=missing)
+    one = AR1(X, Y[:, 1:], low_X=LOW_X[1:], low_Y=LOW_Y[1:, 1:])
     torch.testing.assert_close(two.targets()[1, 1:], one.targets()[0])
+    kernel = {"low_covar_module": Stationary(MATERN52), "input_transform": Normalize(2)}
     assert drawn(AR1(X, Y, low_X=LOW_X, low_Y=LOW_Y, **kernel)).predict(Z).mean.isfinite().all()
 
 
@@ -140,37 +125,34 @@ def test_samples_lie_within_the_bounds_and_the_seed_makes_them():
     assert (low[0].amax(0) - low[0].amin(0) > 0.8 * (BOUNDS[1] - BOUNDS[0])).all()
 
 
-@pytest.mark.parametrize(("low", "high"), [(1e-12, 1e-12), (1e-6, 1e6)])
-def test_units_of_both_levels(low, high):
+def test_units_of_both_levels():
     plain = drawn(AR1(X, Y, low_X=LOW_X, low_Y=LOW_Y))
-    model = drawn(AR1(X, high * Y, low_X=LOW_X, low_Y=low * LOW_Y))
-    torch.testing.assert_close(model.predict(Z).mean / high, plain.predict(Z).mean)
+    model = drawn(AR1(X, 1e6 * Y, low_X=LOW_X, low_Y=1e-6 * LOW_Y))
+    torch.testing.assert_close(model.predict(Z).mean / 1e6, plain.predict(Z).mean)
 
 
-@pytest.mark.slow
-def test_a_function_and_a_cheap_version_of_it():
-    """Of Forrester et al. (2007): the function, and half of it with a line."""
-
-    def high(X):
-        return (6 * X - 2).square() * (12 * X - 4).sin()
-
-    X, Z = line(6, 0.05, 0.95), line(50)
-    model = AR1(X, high(X), physics=lambda X: 0.5 * high(X) + 10 * X - 10, bounds=[[0.0], [1.0]])
-    fit(model)
-    assert (model.predict(Z).mean - high(Z)).square().mean().sqrt() < 0.2 * high(Z).std()
-    lower, upper = model.interval(Z)
-    assert ((lower <= high(Z)) & (high(Z) <= upper)).double().mean() > 0.9
+def test_a_summary_has_names_and_units_of_the_kernels():
+    kernel = ScaleKernel(MaternKernel())
+    options = {"low_covar_module": kernel, "delta_covar_module": kernel}
+    model = AR1(X, Y[:, :1], low_X=LOW_X, low_Y=LOW_Y[:, :1], **options)
+    low, delta = model.summary().split("  delta: ")
+    sizes = {name: value.sqrt().item() for name, value in model.values.items()}
+    assert (
+        f"standard deviation over that of low_Y: {sizes['low.kernel.raw_outputscale']:.3g}" in low
+    )
+    assert "base_kernel.lengthscale" in low
+    for name, part in (("standard deviation", "raw_outputscale"),
+                       ("standard deviation of the constant", "constant")):  # fmt: skip
+        size = sizes[f"delta.kernel.{part}"] * model.unit.item()
+        assert f"    {name}: {size:.3g}\n" in delta
 
 
 @pytest.mark.parametrize(("options", "words"), [
-    ({}, "low level"),
     ({"physics": crude}, "bounds"),
     ({"low_Y": LOW_Y}, "low_X"),
     ({"physics": crude, "bounds": BOUNDS.flip(0)}, "below"),
-    ({"low_X": LOW_X[:, :1], "low_Y": LOW_Y}, "2 inputs"),
-    ({"low_X": LOW_X, "low_Y": LOW_Y[:, :1]}, "and 2 outputs"),
-    ({"low_X": LOW_X, "physics": FunctionPhysics(
-        lambda X, p: crude(X), unknowns={"w": Unknown(1.0, sd=1.0)})}, "CKA"),
+    ({"low_X": LOW_X, "low_Y": LOW_Y[:, :1]}, "2 inputs and 2 outputs"),
+    ({"low_X": LOW_X, "physics": UNKNOWN}, "CKA"),
 ])  # fmt: skip
 def test_bad_input(options, words):
     refused(ValueError, words, AR1, X, Y, **options)

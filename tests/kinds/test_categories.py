@@ -10,7 +10,7 @@ from gpytorch.kernels import MaternKernel, ScaleKernel
 
 from gpadjust.core import CKA, MATERN52, RRA, StackedGP, Stationary, ZeroMeanGP, fit, load, save
 from gpadjust.kinds.categories import Categories, levels_of, on_levels
-from tests.systems import drawn, line, normal, refused, slopes, uniform
+from tests.systems import drawn, line, normal, refused, uniform
 
 GENERATOR = torch.Generator().manual_seed(0)
 N = 30
@@ -55,7 +55,6 @@ def model():
 
 @pytest.mark.parametrize("profile", [None, MATERN52])
 def test_the_covariance_is_exchangeable(profile):
-    """The dense formula, and the gradient by differences."""
     kernel = None if profile is None else Stationary(profile)
     model = drawn(ZeroMeanGP(X, Y, covar_module=kernel, input_transform=Categories([1], 2)))
     assert [term.name for term in model.terms] == ["f", "x3"]
@@ -65,17 +64,12 @@ def test_the_covariance_is_exchangeable(profile):
     squares = ((FLOW[:, None] - FLOW) / flow).square() + unlike[0] / material.square()
     t = (5 * squares).sqrt()
     k = (-squares / 2).exp() if profile is None else (1 + t + t.square() / 3) * (-t).exp()
-    scale, kappa, rigs = (
-        own[n].squeeze(1) for n in ("f.kernel.outputscale", "f.constant", "x3.kernel.outputscale")
-    )
+    names = ("f.kernel.outputscale", "f.constant", "x3.kernel.outputscale")
+    scale, kappa, rigs = (own[name].squeeze(1) for name in names)
     expected = scale * k + kappa + rigs * (1 - unlike[1])
     f = model.evaluate(X)
     same(f.cross(f)[:, 0], expected)
     same(f.variance().expand(2, 1, N)[:, 0], expected.diagonal(dim1=-1, dim2=-2))
-    u = model.u.detach()
-    _, gradient = model.log_likelihood(u)
-    expected = slopes(lambda u: model.log_likelihood(u)[0], u)
-    torch.testing.assert_close(gradient, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_levels_by_random_features_are_as_far_apart():
@@ -91,23 +85,18 @@ def test_levels_by_random_features_are_as_far_apart():
 def test_names_of_levels_do_not_matter():
     order = torch.tensor([2.0, 0.0, 1.0]).double()
     other = X.clone()
-    other[:, 1] = order[MATERIAL]
-    a, b = (drawn(ZeroMeanGP(x, Y, input_transform=Categories([1], [2]))) for x in (X, other))
+    other[:, 1] = 10 + order[MATERIAL]
+    a = drawn(ZeroMeanGP(X, Y, input_transform=Categories([1], [2])))
+    b = drawn(ZeroMeanGP(other, Y, input_transform=Categories([-2], [2])))
     same(torch.stack(a.log_likelihood(a.u)[:1]), torch.stack(b.log_likelihood(b.u)[:1]))
     same(a.predict(X).variance, b.predict(other).variance)
-    numbers = X + torch.tensor([0.0, 10.0, 0.0])
-    c = drawn(ZeroMeanGP(numbers, Y, input_transform=Categories([-2], [2])))
-    same(a.predict(X).mean, c.predict(numbers).mean)
-    assert levels_of(c)[1] == (10.0, 11.0, 12.0)
+    assert levels_of(b)[1] == (10.0, 11.0, 12.0)
 
 
-@pytest.mark.parametrize(
-    ("structure", "options"),
-    [(ZeroMeanGP, {}), (RRA, {"physics": lambda X: X[:, 0], "num_features": 64})],
-)
-def test_a_category_that_does_not_matter_is_as_if_left_out(structure, options):
-    model = structure(X[:, :2], Y, **options, input_transform=Categories([1]))
-    plain = structure(X[:, :1], Y, **options)
+def test_a_category_that_does_not_matter_is_as_if_left_out():
+    options = {"physics": lambda X: X[:, 0], "num_features": 64}
+    model = RRA(X[:, :2], Y, **options, input_transform=Categories([1]))
+    plain = RRA(X[:, :1], Y, **options)
     for row in (*model.table.own, *plain.table.own):
         if row.name.endswith("lengthscale"):
             numbers = torch.tensor([2.0, 1e9]).double().log()
@@ -153,7 +142,6 @@ def test_files_and_mixtures(model, tmp_path):
     again = load(tmp_path / "model.pt", trusted=True)
     same(moments(again, NEW)[1], moments(later, NEW)[1])
     assert levels_of(again) == levels_of(model)
-    refused(ValueError, "found wood", again.predict, FRAME[:2].assign(material="wood"))
     stacked = StackedGP({"CKA": model}, [[1.0]], 4)
     assert moments(stacked.condition_on_observations(NEW, Y[:4]), NEW)[0].shape == (4, 1)
     assert levels_of(stacked) == levels_of(model)
@@ -176,16 +164,15 @@ def test_outputs_declared_levels_and_kernels_of_gpytorch():
 
 def test_which_columns_are_categories():
     years = pd.Categorical([2020, 2021, 2022] * 4)
-    frame = pd.DataFrame({"size": line(12)[:, 0], "text": ["low", "high"] * 6, "year": years})
-    frame["text"] = frame["text"].astype(object)
+    text = pd.Series(["low", "high"] * 6, dtype=object)
+    frame = pd.DataFrame({"size": line(12)[:, 0], "text": text, "year": years})
     model = ZeroMeanGP(frame, uniform(12, 1), input_transform=Categories())
     assert levels_of(model) == {1: ("high", "low"), 2: (2020.0, 2021.0, 2022.0)}
     ids = frame.assign(text=[f"no {i}" for i in range(12)])
-    refused(TypeError, "text", ZeroMeanGP, ids, uniform(12, 1), input_transform=Categories())
+    for texts in (ids, frame.assign(text=["1", "2"] * 6)):
+        refused(TypeError, "text", ZeroMeanGP, texts, uniform(12, 1), input_transform=Categories())
     named = ZeroMeanGP(ids, uniform(12, 1), input_transform=Categories(["text"]))
     assert len(levels_of(named)[1]) == 12
-    numbers = frame.assign(text=["1", "2"] * 6)
-    refused(TypeError, "text", ZeroMeanGP, numbers, uniform(12, 1), input_transform=Categories())
     assert levels_of(ZeroMeanGP(X, Y, input_transform=Categories())) == {}
     assert levels_of(ZeroMeanGP(X, Y)) == {}
 
@@ -210,15 +197,12 @@ REFUSED = [
     ({"columns": "colour"}, "inputs flow, material, rig; found 'colour'"),
     ({"batches": 7}, "found 7"),
     ({"levels": {"material": ["iron", "iron"]}}, "different levels of material"),
-    ({"levels": {"material": ["iron", 2.0]}}, "different levels of material"),
     ({"levels": {"material": ["iron", "steel"]}}, "one of iron, steel; found brass"),
     (lambda model: model.predict(WOOD), "brass, iron, steel; found wood"),
     (lambda model: model.predict(BETWEEN), "one of 0.0, 1.0, 2.0; found 1.5.*fixed_features"),
-    (
-        lambda _: ZeroMeanGP(X[:, 2:], Y, input_transform=Categories(batches=0)),
-        "in addition to batches",
-    ),
-]
+    (lambda _: ZeroMeanGP(X[:, 2:], Y, input_transform=Categories(batches=0)),
+     "in addition to batches"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("case", "words"), REFUSED)

@@ -8,7 +8,6 @@ from torch.nn.functional import silu
 from gpadjust.core import CKA, GP, CalibratedPhysics, Term, ZeroMeanGP, fit, load, save
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.noisy_inputs import NoisyInputs
-from gpadjust.kinds.relative import RelativeNoise
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, Unknown
 from tests.systems import line, normal, refused, uniform
 
@@ -22,10 +21,6 @@ def f_p(X):
 
 def truth(X):
     return 1.2 * f_p(X) + X.square()
-
-
-def forrester(X):
-    return (6 * X - 2).square() * torch.sin(12 * X - 4)
 
 
 def case(seed=3, truth=truth, n=30):
@@ -68,34 +63,19 @@ def test_moments_are_those_of_the_function_at_the_true_inputs():
 
 
 @pytest.mark.slow
-def test_it_is_nearer_than_what_ignores_it():
-    half = lambda X: 0.5 * forrester(X) + 10 * (X - 0.5) - 5  # noqa: E731
-    ratios = []
-    for seed in range(3):
-        X, Y = case(seed, forrester)
-        models = (CKA(X, Y, physics=half), model_of(X, Y, SD**2, physics=half))
-        off = []
-        for model in models:
-            fit(model, "map")
-            off.append((model.predict(TEST).mean - forrester(TEST)).square().mean().sqrt().log())
-        ratios.append(off[1] - off[0])
-    assert sum(ratios) / 3 < -0.2
-
-
-@pytest.mark.slow
 def test_an_unknown_parameter_is_nearer_to_the_truth():
     true = uniform(200, 1)
     X, Y = true + 0.1 * normal(200, 1, seed=1), 2 * (true - 0.5) + 0.02 * normal(200, 1, seed=2)
     law = FunctionPhysics(lambda X, p: p.a * (X[:, 0] - 0.5), unknowns={"a": Unknown(1.0, sd=2.0)})
-    models = (
-        CalibratedPhysics(X, Y, physics=law),
-        model_of(X, Y, 0.01, CalibratedPhysics, physics=law),
-    )
-    for model in models:
+    options = {"physics": law}
+    slopes = []
+    for model in (
+        CalibratedPhysics(X, Y, **options), model_of(X, Y, 0.01, CalibratedPhysics, **options),
+    ):  # fmt: skip
         fit(model, "map")
-    ignoring, noisy = (model.physics_parameters.mean.item() for model in models)
-    assert ignoring < 1.85  # by 12 %, as errors in variables have it
-    assert abs(noisy - 2) < 0.1
+        slopes.append(model.physics_parameters.mean.item())
+    assert slopes[0] < 1.85  # by 12 %, as errors in variables have it
+    assert abs(slopes[1] - 2) < 0.1
 
 
 def test_exact_inputs_change_nothing():
@@ -110,35 +90,20 @@ def test_exact_inputs_change_nothing():
 def test_outliers_of_noisy_inputs(is_inner, tmp_path):
     off = Y.clone()
     off[5] += 4.0
-    if is_inner:
-        noisy = NoisyInputs(X, SD**2)
-        X_hat, noise = noisy.X, HeavyTails(base=noisy)
-    else:
-        noise = NoisyInputs(X, SD**2, base=HeavyTails())
-        X_hat = noise.X
-    model = CKA(X_hat, off, physics=silu, noise=noise)
+    noisy = NoisyInputs(X, SD**2, base=None if is_inner else HeavyTails())
+    noise = HeavyTails(base=noisy) if is_inner else noisy
+    model = CKA(noisy.X, off, physics=silu, noise=noise)
     fit(model, "map")
     assert model.noise.is_outlier.flatten().nonzero().tolist() == [[5]]
     alone = torch.arange(30) != 5
     without = model_of(X[alone], off[alone], SD**2, physics=silu)
     fit(without, "map")
-    assert (model.predict(TEST).mean - without.predict(TEST).mean).abs().max() < 0.15
+    first = model.predict(TEST, True)
+    assert (first.mean - without.predict(TEST).mean).abs().max() < 0.15
     assert not save(model, tmp_path / "model.pt").missing
-    again = load(tmp_path / "model.pt", trusted=True)
-    torch.testing.assert_close(again.predict(TEST, True), model.predict(TEST, True))
-    first = model.predict(TEST).mean
+    torch.testing.assert_close(load(tmp_path / "model.pt", trusted=True).predict(TEST, True), first)
     fit(model, "map")
-    assert torch.equal(model.predict(TEST).mean, first)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [{"train_Yvar": 0.02**2}, {"base": RelativeNoise()}])
-def test_other_noise_of_the_targets(options):
-    model = model_of(X, Y, SD**2, physics=f_p, **options)
-    fit(model, "map")
-    assert (model.predict(TEST).mean - truth(TEST)).square().mean().sqrt() < 0.15
-    added = (model.left_out().variances[0] > model.predict(model.data.X, True).variance).sum()
-    assert added > 20
+    assert torch.equal(model.predict(TEST).mean, first.mean)
 
 
 def test_a_black_box_that_cannot_be_asked_everywhere():
@@ -171,16 +136,9 @@ def test_frames_stay_frames():
 
 REFUSED = [
     (lambda: NoisyInputs(X, -1.0), ValueError, "Expected variances in variances"),
-    (lambda: NoisyInputs(X, [1e-3, 1e-3]), ValueError, "one number"),
     (lambda: NoisyInputs(X, 1.0), ValueError, "not standard deviations"),
-    (lambda: NoisyInputs(X, float("nan")), ValueError, "finite"),
     (lambda: NoisyInputs(X, 1e-3, base=0.1), TypeError, "train_Yvar"),
-    (lambda: NoisyInputs(X.float(), 1e-3), TypeError, "double"),
-    (
-        lambda: fit(CKA(X[:9], Y[:9], physics=f_p, noise=NoisyInputs(X, 1e-3))),
-        ValueError,
-        "30 inputs",
-    ),
+    (lambda: fit(CKA(X[:9], Y[:9], physics=f_p, noise=NoisyInputs(X, 1e-3))), ValueError, "30 inp"),
     (lambda: fit(CKA(X, Y, physics=f_p, noise=NoisyInputs(X, 1e-3))), ValueError, "noisy.X"),
 ]
 
@@ -190,16 +148,17 @@ def test_bad_input(call, error, words):
     refused(error, words, call)
 
 
-@pytest.mark.parametrize(
-    ("structure", "options"),
-    [(CKA, {"physics": lambda X: X.sin().expand(-1, 2)}), (ZeroMeanGP, {})],
-)
-def test_later_inputs_are_exact(structure, options):
-    model = model_of(X, torch.cat([Y, 2 * Y.flip(0)], -1), SD**2, structure, **options)
-    fit(model, "map")
-    assert (model.noise.added.amax(-1) > 10 * model.noise.added.amin(-1)).all()
+def test_later_inputs_are_exact():
+    added, moved = torch.full((2, 30), 0.1).double(), torch.full((2, 30), 0.2).double()
+    noisy = NoisyInputs(X, SD**2, added=added, moved=moved)
+    model = ZeroMeanGP(noisy.X, torch.cat([Y, 2 * Y.flip(0)], -1), noise=noisy)
+    # (y - left-out mean) / variance is K^-1 (y - mean - shift).
+    mean, variance = model.left_out().prediction
+    alpha = model.conditioning().alpha[0].mT / model.unit.mT
+    torch.testing.assert_close((model.data.Y - mean) / variance, alpha)
     later = model.condition_on_observations(TEST[:1], 3 + truth(TEST[:1]).expand(-1, 2))
     assert (later.predict(TEST[:1]).mean > model.predict(TEST[:1]).mean).all()
-    assert not later.noise.added[:, 30:].any()
-    assert not later.noise.shift[:, 30:].any()
+    for corrections in (later.noise.added, later.noise.shift):
+        assert corrections[:, :30].all()
+        assert not corrections[:, 30:].any()
     fit(later, "map")

@@ -5,22 +5,19 @@ import pandas as pd
 import pytest
 import torch
 from botorch.models.transforms import Normalize
-from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
+from gpytorch.kernels import MaternKernel, ScaleKernel
 
-from gpadjust.core import CKA, MATERN52, PhysicsMeanGP, ScaleGP, Stationary, fit, load, save
+from gpadjust.core import CKA, MATERN52, PhysicsMeanGP, Stationary
 from gpadjust.kinds.categories import Categories
 from gpadjust.kinds.vanishing import Vanishing
-from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
-from tests.systems import drawn, normal, refused, slopes, uniform
+from gpadjust.physics import FormulaPhysics
+from tests.systems import drawn, normal, refused, uniform
 
 OPEN = Vanishing({"valve": 1.0})
 X = uniform(16, 2, low=0.2)
 Y = 2 * X[:, 1:] ** 2 + 0.5 * (1 / X[:, :1] - 1) * X[:, 1:] ** 2 + 0.01 * normal(16, 1, seed=3)
 FRAME = pd.DataFrame(X.numpy(), columns=["valve", "flow"])
 AT_OPEN = torch.cat([torch.ones(7, 1).double(), uniform(7, 1)], -1)
-PIPE = FunctionPhysics(
-    lambda X, p: p.friction * X[:, 1] ** 2, unknowns={"friction": Unknown(1.0, factor=2.0)}
-)
 SQUARE = FormulaPhysics("flow**2", ["valve", "flow"])
 
 
@@ -28,7 +25,7 @@ def same(actual, expected, tolerance=1e-8):
     torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("where", [{0: 1.0}, {"x1": [0.5, 1.0]}, [[0.5, 0.3], [1.0, 0.4]]])
+@pytest.mark.parametrize("where", [{0: 1.0}, {"x1": [0.5, 1.0]}, {0: [0.5, 1.0], 1: [0.3, 0.4]}])
 def test_the_covariance_is_that_of_a_process_that_was_seen_to_be_zero(where):
     """Conditioning on zeros in dense algebra, of hyperplanes at the other inputs of the points."""
     kernel = Vanishing(where)
@@ -53,77 +50,55 @@ def test_the_covariance_is_that_of_a_process_that_was_seen_to_be_zero(where):
 
 
 @pytest.mark.parametrize("kernel", [None, Stationary(MATERN52)])
-def test_gradients_and_features(kernel):
-    where = {0: 1.0} if kernel is None else [[1.0, 0.4]]
-    options = {"physics": SQUARE, "delta_covar_module": Vanishing(where, kernel), "nested": False}
-    model = drawn(CKA(X, Y, **options))
-    u = model.u.detach()
-    numeric = slopes(lambda u: model.log_likelihood(u, False)[0], u)
-    torch.testing.assert_close(model.log_likelihood(u)[1], numeric, rtol=1e-5, atol=1e-5)
-    own = model.evaluate(X).own(model.terms[1])
-    phi = model.terms[1].kernel.features(own, 20000, torch.Generator().manual_seed(0))
-    phi = phi(X[None, None])
-    expected = model.terms[1].kernel.covariance(own, X[None, None])
+def test_features_have_the_covariance(kernel):
+    where = {0: 1.0} if kernel is None else {0: 1.0, 1: 0.4}
+    model = drawn(PhysicsMeanGP(X, Y, physics=SQUARE, covar_module=Vanishing(where, kernel)))
+    (term,) = model.terms[-1:]
+    own = model.evaluate(X).own(term)
+    phi = term.kernel.features(own, 20000, torch.Generator().manual_seed(0))(X[None, None])
+    expected = term.kernel.covariance(own, X[None, None])
     assert (phi @ phi.mT - expected).abs().max() < 0.05 * own["outputscale"].max()
     there = torch.tensor([[1.0, 0.4]]).double()
-    assert model.terms[1].kernel.features(own, 64, torch.Generator())(there).abs().max() < 1e-7
+    assert term.kernel.features(own, 64, torch.Generator())(there).abs().max() < 1e-7
 
 
 def test_delta_and_rho_are_right_there():
     both = CKA(FRAME, Y, physics=SQUARE, rho_covar_module=OPEN, delta_covar_module=OPEN)
-    scale = ScaleGP(FRAME, Y, physics=SQUARE, covar_module=OPEN)
-    for model in (drawn(both), drawn(scale)):
-        mean, variance = model.predict(AT_OPEN)
-        same(mean, AT_OPEN[:, 1:] ** 2, 1e-7)
-        assert variance.max() < 1e-9
-        rho = model.rho(AT_OPEN)
-        same(rho.mean, torch.ones(7, 1).double())
-        assert rho.variance.max() < 1e-9
-        assert model.rho(AT_OPEN - torch.tensor([0.5, 0.0])).variance.min() > 1e-6
+    mean, variance = drawn(both).predict(AT_OPEN)
+    same(mean, AT_OPEN[:, 1:] ** 2, 1e-7)
+    assert variance.max() < 1e-9
+    rho = both.rho(AT_OPEN)
+    same(rho.mean, torch.ones(7, 1).double())
+    assert rho.variance.max() < 1e-9
+    assert both.rho(AT_OPEN - torch.tensor([0.5, 0.0])).variance.min() > 1e-6
     for center in (True, 0.0):  # rho alone may be another factor
         model = CKA(FRAME, Y, physics=SQUARE, delta_covar_module=OPEN, center=center)
         delta = model.delta(AT_OPEN)
         assert torch.cat([delta.mean, delta.variance]).abs().max() < 1e-9
         assert (model.predict(AT_OPEN).mean / AT_OPEN[:, 1:] ** 2 - 1).abs().min() > 0.05
     # It is the kernel of the term that it is in.
-    names = ["rho.kernel.outputscale", "delta.kernel.outputscale"]
     plain = CKA(FRAME, Y, physics=SQUARE)
-    for name in names:
+    for name in ("rho.kernel.outputscale", "delta.kernel.outputscale"):
         same(both.table.values(0 * both.u[:1])[name], plain.table.values(0 * plain.u)[name])
 
 
-@pytest.mark.slow
-def test_unknown_parameters_are_those_of_the_place(tmp_path):
-    model = PhysicsMeanGP(FRAME, Y, physics=PIPE, covar_module=OPEN)
-    fit(model, num_draws=16)
-    lower, upper = model.physics_parameters.interval()
-    assert lower < 2 < upper
-    assert upper - lower < 0.8
-    assert model.delta(AT_OPEN).variance.max() < 1e-9
-    more = model.condition_on_observations(AT_OPEN[:2], 2 * AT_OPEN[:2, 1:] ** 2)
-    assert more.delta(AT_OPEN).variance.max() < 1e-9
-    known = PhysicsMeanGP(FRAME, Y, physics=SQUARE, covar_module=OPEN)
-    saved = save(known, tmp_path / "model.pt")
-    assert saved.missing == ()
-    assert load(saved.path).delta(AT_OPEN).variance.max() < 1e-9
-
-
-def test_transforms_categories_and_what_has_no_covariance():
-    wide = FRAME * [10.0, 1.0]
-    where = Vanishing({"valve": 10.0})
-    options = {"physics": SQUARE, "covar_module": where}
-    for transform in (None, Normalize(2)):
-        model = PhysicsMeanGP(wide, Y, **options, input_transform=transform)
-        there = AT_OPEN * torch.tensor([10.0, 1.0])
-        assert model.delta(there).variance.max() < 1e-9
-        assert model.delta(there - 1).variance.min() > 1e-6
+def test_transforms_and_categories():
+    wide = PhysicsMeanGP(
+        FRAME * [10.0, 1.0], Y, physics=SQUARE, covar_module=Vanishing({"valve": 10.0}),
+        input_transform=Normalize(2),
+    )  # fmt: skip
+    there = AT_OPEN * torch.tensor([10.0, 1.0])
+    assert wide.delta(there).variance.max() < 1e-9
+    assert wide.delta(there - 1).variance.min() > 1e-6
     metals = FRAME.assign(metal=["brass", "steel", "iron", "steel"] * 4)
     physics = {"physics": lambda X: X[:, 1] ** 2, "input_transform": Categories()}
     for where, right in (({"valve": 1.0}, {"valve": 1.0}), ({"metal": 2}, {"metal": "steel"})):
-        kernel = Vanishing(where)
-        model = PhysicsMeanGP(metals, Y, **physics, covar_module=kernel)
+        model = PhysicsMeanGP(metals, Y, **physics, covar_module=Vanishing(where))
         assert model.delta(metals.assign(**right)).variance.max() < 1e-9
         assert model.delta(metals).variance.max() > 1e-5
+
+
+def test_numbers_without_a_covariance_are_impossible():
     model = PhysicsMeanGP(X, Y, physics=SQUARE, covar_module=Vanishing({0: 1.0}))
     values = {n.removeprefix("delta.kernel."): v for n, v in model.values.items()}
     values["outputscale"] = values["outputscale"] * torch.nan
@@ -134,22 +109,17 @@ def test_transforms_categories_and_what_has_no_covariance():
     assert gradient.isfinite().all()
 
 
-def test_places():
-    names = ("valve", "flow")
-    for where, expected in [
-        ({"flow": [0.0, 1.0]}, [[None, 0.0], [None, 1.0]]),
-        ({1: 0.0, "valve": 2}, [[2.0, 0.0]]),
-        ({-1: 3}, [[None, 3.0]]),
-        (np.array([[1.0, 2.0]]), [[1.0, 2.0]]),
-        ([[1.0, 2.1]], [[1.0, 2.1]]),
-        (pd.DataFrame({"flow": [4.0]}), [[None, 4.0]]),
-    ]:
-        model = PhysicsMeanGP(FRAME, Y, physics=SQUARE, covar_module=Vanishing(where))
-        found = model.terms[1].kernel.places.tolist()
-        assert [[None if v != v else v for v in row] for row in found] == expected
-        again = Vanishing(**Vanishing(where).settings)
-        assert torch.equal(again.values, Vanishing(where).values)
-        assert model.data.input_names == names
+@pytest.mark.parametrize(("where", "expected"), [
+    ({"flow": [0.0, 1.0]}, [[-1.0, 0.0], [-1.0, 1.0]]),
+    ({1: 0.0, "valve": 2}, [[2.0, 0.0]]),
+    ({-1: 3}, [[-1.0, 3.0]]),
+    (pd.DataFrame({"flow": [4.0]}), [[-1.0, 4.0]]),
+])  # fmt: skip
+def test_places(where, expected):
+    model = PhysicsMeanGP(FRAME, Y, physics=SQUARE, covar_module=Vanishing(where))
+    assert model.terms[1].kernel.places.nan_to_num(nan=-1.0).tolist() == expected
+    again = Vanishing(**Vanishing(where).settings)
+    assert torch.equal(again.values, Vanishing(where).values)
 
 
 class Turned(Normalize):
@@ -157,17 +127,14 @@ class Turned(Normalize):
         return X @ torch.tensor([[0.6, 0.8], [-0.8, 0.6]]).to(X)
 
 
-REFUSED = [  # places, and options of a model if there are some
-    ({}, None, "number for each column"),
-    ({"valve": []}, None, "number for each column"),
-    (np.zeros((0, 2)), None, "number for each column"),
-    ({"valve": [0.0, 1.0], "flow": [1.0, 2.0, 3.0]}, None, "equally many numbers for each"),
-    ({"valve": float("nan")}, None, "finite"),
-    (np.zeros(3), None, r"points p x d.*\(3,\)"),
-    ({"metal": "steel"}, None, "category.*level"),
+REFUSED = [  # places, a kernel and a transform
+    (np.zeros((1, 2)), {}, "values of columns, .* or a frame"),
+    ({}, {}, "number for each column"),
+    ({"valve": [0.0, 1.0], "flow": [1.0, 2.0, 3.0]}, {}, "equally many numbers for each"),
+    ({"valve": float("nan")}, {}, "finite"),
+    ({"metal": "steel"}, {}, "category.*level"),
     ({"vane": 1.0}, {}, "`where` by names or numbers of the inputs valve, flow; found 'vane'"),
     ({2: 1.0}, {}, "numbers of the inputs valve, flow; found 2"),
-    (np.zeros((1, 3)), {}, "points of 2 columns"),
     ({0: 1.0}, {"kernel": Stationary(MATERN52)}, "a product over the inputs"),
     ({0: 1.0}, {"kernel": ScaleKernel(MaternKernel())}, "a product over the inputs"),
     ({0: 1.0}, {"input_transform": Turned(2)}, "mixes columns"),
@@ -176,16 +143,9 @@ REFUSED = [  # places, and options of a model if there are some
 
 @pytest.mark.parametrize(("where", "options", "words"), REFUSED)
 def test_bad_places_kernels_and_transforms(where, options, words):
-    if options is None:
-        return refused(ValueError, words, Vanishing, where)
-    kernel = Vanishing(where, options.get("kernel"))
-    transform = {"input_transform": options.get("input_transform")}
-    refused(
-        ValueError, words, PhysicsMeanGP, FRAME, Y, physics=SQUARE, covar_module=kernel, **transform
-    )
-    return None
+    def call():
+        kernel = Vanishing(where, options.get("kernel"))
+        transform = options.get("input_transform")
+        PhysicsMeanGP(FRAME, Y, physics=SQUARE, covar_module=kernel, input_transform=transform)
 
-
-def test_a_product_of_kernels_of_gpytorch_vanishes():
-    of_gpytorch = ScaleKernel(RBFKernel(active_dims=[0]) * MaternKernel(active_dims=[1]))
-    PhysicsMeanGP(X, Y, physics=SQUARE, covar_module=Vanishing({0: 1.0}, of_gpytorch))
+    refused((TypeError, ValueError), words, call)
