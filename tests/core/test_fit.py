@@ -236,3 +236,10 @@ def test_seeds_agree_of_clustered_inputs_and_exact_data():
     assert away.square().mean().sqrt() < 0.5
     X, _ = noisy(256)
     assert fit(ZeroMeanGP(X, (3 * X).sin().sum(-1, True))).converged
+
+
+def test_the_generator_is_left_alone():
+    X, e = noisy(12)
+    before = torch.random.get_rng_state()
+    fit(CKA(X, wave(X) + e, physics=wave))
+    assert torch.equal(before, torch.random.get_rng_state())

@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 from botorch.models.transforms import Normalize
+from botorch.sampling.pathwise import draw_matheron_paths
 
 from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, Stationary, ZeroMeanGP
 from gpadjust.physics import FunctionPhysics, Unknown
@@ -90,3 +91,13 @@ def test_each_function_is_evaluated_at_its_own_points_only(data, uniform):
     asked.clear()
     torch.testing.assert_close(functions.evaluate_each(points), expected)
     assert sum(asked) == 6 * 4
+
+
+def test_paths_of_botorch(data, drawn, uniform):
+    X, Y = data()
+    model = drawn(CKA(X, Y, physics=lambda X: crude(X)[..., :1]))
+    Z = uniform(5, 2)
+    assert draw_matheron_paths(model, torch.Size([4]))(Z).shape == (4, 5)
+    values, posterior = draw_matheron_paths(model, torch.Size([600]))(Z), model.posterior(Z)
+    error = values.mean(0) - posterior.mean.squeeze(-1)
+    assert (error.abs() < 0.15 * posterior.variance.sqrt().squeeze(-1)).all()

@@ -180,3 +180,11 @@ def test_where_the_physics_fails_there_is_no_density():
     u = torch.full_like(model.u.detach(), -9.0)
     for with_gradient in (False, True):
         assert model.log_likelihood(u, with_gradient)[0].item() == -torch.inf
+
+
+def test_a_physics_that_fails_is_impossible_with_and_without_a_gradient():
+    model = power()
+    u = torch.zeros_like(model.u)
+    u[..., -1] = 3.5  # x to the power of 16,000
+    assert model.log_likelihood(u, False)[0].item() == -torch.inf
+    assert model.log_likelihood(u)[0].item() == -torch.inf

@@ -156,3 +156,18 @@ def test_a_summary_has_names_and_units_of_the_kernels():
 ])  # fmt: skip
 def test_bad_input(options, words):
     refused(ValueError, words, AR1, X, Y, **options)
+
+
+def test_recursive_co_kriging_on_nested_designs_without_noise(close):
+    """The recursion of Le Gratiet and Garnier (2014) is the joint model then."""
+    model = AR1(LOW_X[:6], 1.7 * LOW_Y[:6] + LOW_X[:6].sin(), 1e-12, low_X=LOW_X, low_Y=LOW_Y)
+    values = {row.name: 0.0 for row in model.table.own}
+    values |= {f"{name}.kernel.lengthscale": -1.0 for name in ("low", "delta")}  # 0.5
+    u = torch.cat([torch.full_like(r.location, values[r.name]) for r in model.table.own], -1)
+    model.set_draws(u.reshape(model.u.shape))
+    part = Dense(model.eval(), 0, 0, 1e-12)
+    k1, k2, rho, y1, x2 = part.k1, part.k2, part.rho, LOW_Y[:, 0], LOW_X[:6]
+    exact = part.noise[:11].diag()
+    first = k1(Z, LOW_X) @ torch.linalg.solve(k1(LOW_X, LOW_X) + exact, y1)
+    bias = k2(Z, x2) @ torch.linalg.solve(k2(x2, x2), model.data.Y[:, 0] - rho * y1[:6])
+    close(model.predict(Z).mean[:, 0], rho * first + bias, 1e-4)
