@@ -19,10 +19,11 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control import episodes
-from gpadjust.control.checkpoint import EpisodeCheckpoint, locks_of, pickled_environment
+from gpadjust.control.checkpoint import EpisodeCheckpoint, pickled_environment
 from gpadjust.control.learning import (
     check_functions,
     learn_dynamics,
+    locks_of,
     warn_of_bounds,
     warn_of_promise,
 )

@@ -10,8 +10,8 @@ import sys
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -98,16 +98,6 @@ class EpisodeCheckpoint:
             ) from error
         with acquired:
             yield
-
-
-@contextmanager
-def locks_of(callbacks: Iterable[Any]) -> Iterator[None]:
-    """Hold the locks of the checkpoints among callbacks."""
-    with ExitStack() as stack:
-        for callback in callbacks:
-            if isinstance(callback, EpisodeCheckpoint):
-                stack.enter_context(callback.locked())
-        yield
 
 
 def resume(path: str | Path, env: Any, task: Task, algorithm: Any = None) -> Any:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gpadjust.checks import warn
+from gpadjust.control.checkpoint import EpisodeCheckpoint
 from gpadjust.control.delay import find_delay
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics, Trajectories
@@ -21,6 +24,16 @@ from gpadjust.states import StateSpec
 _NEAR = 0.05  # of half the width between bounds: they may have held a state that is so near
 _ROUNDING = 1e-5  # of set-points, in single precision
 _WINDOWS = 4  # windows of scored trajectories: some half second for a model of an episode
+
+
+@contextmanager
+def locks_of(callbacks: Iterable[Any]) -> Iterator[None]:
+    """Hold the locks of the checkpoints among callbacks."""
+    with ExitStack() as stack:
+        for callback in callbacks:
+            if isinstance(callback, EpisodeCheckpoint):
+                stack.enter_context(callback.locked())
+        yield
 
 
 def check_functions(task: Task, data: Trajectories, tolerance: float = 1e-3) -> None:

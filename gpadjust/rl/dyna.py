@@ -30,8 +30,8 @@ from stable_baselines3.common.vec_env import (
 from gpadjust.checks import check_kind
 from gpadjust.control import EpisodeCheckpoint, StepGuard, Task
 from gpadjust.control import episodes as real
-from gpadjust.control.checkpoint import locks_of, pickled_environment
-from gpadjust.control.learning import check_functions, learn_dynamics
+from gpadjust.control.checkpoint import pickled_environment
+from gpadjust.control.learning import check_functions, learn_dynamics, locks_of
 from gpadjust.control.summary import agent_table, agent_text
 from gpadjust.display import Display
 from gpadjust.dynamics import Trajectories
