@@ -111,7 +111,10 @@ class Predictive(Model, FantasizeMixin, Display):
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
     ) -> Any:  # fmt: skip
-        """Return the joint posterior at ``... x q x d`` in BoTorch's form: ``... x q x m``."""
+        """Return the joint posterior in BoTorch's form.
+
+        It is ``... x q x m`` of inputs ``... x q x d``.
+        """
         self.eval()
         outputs: list[int] | slice = slice(None)
         if output_indices is not None:
