@@ -509,14 +509,20 @@ class TargetPhysics(Physics):
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the targets by the physics, ``N x m``."""
-        targets = self.targets
-        num_states = len(targets.spec.moving)
-        inputs = some_columns(X, targets.of_physics)
+        inputs = some_columns(X, self.targets.of_physics)
         try:
             following = self.physics.of_rows(self.physics.read_rows(inputs, *parameters))
         except PhysicsError as error:
-            error.partial = None  # it has next states, not targets
+            if error.partial is not None:
+                fails = ~error.partial.isfinite().all(-1, keepdim=True)
+                error.partial = self._of_states(X, error.partial).masked_fill(fails, torch.nan)
             raise
+        return self._of_states(X, following)
+
+    def _of_states(self, X: Tensor, following: Tensor) -> Tensor:
+        """Return the targets by next states."""
+        targets = self.targets
+        num_states = len(targets.spec.moving)
         check_next_values(self.physics, following, num_states)
         change = following - X[:, :num_states]
         columns = []
