@@ -283,7 +283,8 @@ def _around_ridges(model: GP, others: dict[int, Draws], number: int, seed: int) 
     for k, start in _starts(model, seed).items():
         straight = Straight(model, start, k)
         points = straight.points(_FIRST * number, seed)
-        draws = sample(straight, like, number, seed, straight.start, _FIRST, with_moves, points)
+        start, guide = straight.start, straight.linear
+        draws = sample(straight, like, number, seed, start, _FIRST, with_moves, points, guide)
         sampled[k] = draws._replace(u=straight.coordinates(draws.u))
         if k in others:
             sampled[k] = _joined(sampled[k], others[k], straight.misses(others[k].u))

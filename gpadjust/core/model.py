@@ -37,6 +37,7 @@ from gpadjust.physics.unknown import Unknowns
 from gpadjust.progress import tick
 
 Slopes = dict[str, list[Tensor]]
+PhysicsAt = Callable[[Values, bool], tuple[list[Tensor], Slopes]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
 
 _ENTRIES = 150_000  # of covariances that are computed at once and fit into caches
@@ -305,19 +306,22 @@ class GP(gpytorch.models.GP, Predictive):
 
     @torch.no_grad()
     def log_likelihood(
-        self, u: Tensor, with_gradient: bool = True, *, choice: int | None = None
-    ) -> tuple[Tensor, Tensor]:
+        self, u: Tensor, with_gradient: bool = True, *, choice: int | None = None,
+        physics: PhysicsAt | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Return the log likelihood of the targets at coordinates ``S x B x P``, and its gradient.
 
         It is in units of the targets, minus infinity where it or f_p is not finite; a choice is the
-        number of a nested model. The gradient is zero if it is not asked for.
+        number of a nested model. The gradient is zero if it is not asked for. ``physics`` takes the
+        place of :meth:`physics_with_slopes`.
         """
         if choice is not None:
             u = self.table.with_choice(u, choice)
         f: list[Tensor] | None = None
         slopes: Slopes = {}
         if self._unknowns:  # f_p is called once, at all draws
-            f, slopes = self._physics_with_slopes(self.table.values(u), with_gradient)
+            physics = physics or self.physics_with_slopes
+            f, slopes = physics(self.table.values(u), with_gradient)
         m, n = self.targets().shape[-2:]
         values, gradients = [], []
         for rows in torch.arange(len(u)).split(max(1, _ENTRIES // (n * n * m))):
@@ -367,7 +371,7 @@ class GP(gpytorch.models.GP, Predictive):
     def _with_failures(self, u: Tensor) -> tuple[WeightedSum, Tensor, Tensor]:
         """Return what :meth:`_observed` does at coordinates, NaN where f_p fails."""
         values = self.table.values(u)
-        return self._observed(values, self._physics_with_slopes(values, False)[0])
+        return self._observed(values, self.physics_with_slopes(values, False)[0])
 
     def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
@@ -507,9 +511,7 @@ class GP(gpytorch.models.GP, Predictive):
         z = torch.cat([values[f"physics.{name}"] for name in physics.unknowns], -1)
         return [physics.unknowns.to_values(z)]
 
-    def _physics_with_slopes(
-        self, values: Values, with_slopes: bool
-    ) -> tuple[list[Tensor], Slopes]:
+    def physics_with_slopes(self, values: Values, with_slopes: bool) -> tuple[list[Tensor], Slopes]:
         """Return each physics at the training inputs, NaN where it fails, and its derivatives."""
         X = self.data.X
         names = [*self._unknowns]

@@ -19,7 +19,7 @@ LogLikelihood = Callable[..., tuple[Tensor, Tensor]]
 GROUPS = 2  # of draws that are resampled apart; their difference is the error
 _SHARE = 0.5  # of the resulting draws, that count after each step of the power
 _MOVES, _LAST_MOVES = 3, 4  # of each draw after a step of the power, and after the last step
-_LEAPS = 3  # steps of the Hamiltonian dynamics in a move
+_LEAPS, _GUIDED_LEAPS = 3, 6  # steps of the Hamiltonian dynamics in a move
 _FIRST_LENGTH = 0.3  # of these steps, in standard deviations of the draws
 _ACCEPTED = 0.8  # share of moves that the length is adapted to
 _FAR = 60.0  # coordinates, prior standard deviations, beyond which no draw moves
@@ -59,7 +59,7 @@ class Draws(NamedTuple):
 def sample(
     log_likelihood: LogLikelihood, like: Tensor, number: int, seed: int,
     start: Normal | None = None, first: int = 16, with_moves: bool = True,
-    points: Tensor | None = None,
+    points: Tensor | None = None, guide: LogLikelihood | None = None,
 ) -> Draws:  # fmt: skip
     r"""Draw from :math:`N(u | 0, I) \, L(u)` by sequential Monte Carlo (Del Moral et al. 2006).
 
@@ -77,6 +77,8 @@ def sample(
         first: How many draws begin for each one that results.
         with_moves: Whether draws are moved; without, they are weighted and resampled once.
         points: Draws of the start from N(0, I), if not random ones, ``(first number) x B x P``.
+        guide: A cheaper likelihood, whose gradient leads the moves; L itself decides on their ends
+            (Neal 2011, section 5.5.4).
     """
     shape = like.shape
     generator = torch.Generator().manual_seed(seed)
@@ -84,8 +86,10 @@ def sample(
     prior = Normal(torch.zeros_like(like), eye)
     begin = prior if start is None else start
 
-    def ratio(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
-        value, slope = log_likelihood(u, with_gradient)
+    def ratio(
+        u: Tensor, with_gradient: bool = True, of: LogLikelihood = log_likelihood
+    ) -> tuple[Tensor, Tensor]:
+        value, slope = of(u, with_gradient)
         if start is None:
             return value, slope
         # log L(u) + log N(u | 0, I) - log q(u)
@@ -93,6 +97,7 @@ def sample(
         b, by_b = start.log_density(u)
         return value + a - b, slope + by_a - by_b
 
+    guided = None if guide is None else partial(ratio, of=guide)
     if points is None:
         points = standard_normal((first * number, *shape), generator, like)
     u = begin.mean + (begin.root @ points.unsqueeze(-1)).squeeze(-1)
@@ -122,22 +127,30 @@ def sample(
         if not with_moves:
             return Draws(u, evidence)
         if is_first:
-            value, slope = ratio(u)
+            if guided is None:
+                value, slope = ratio(u)
+            else:
+                slope = guided(u)[1]
             is_first = False
         is_done = bool((power >= 1).all())
         for _ in range(_LAST_MOVES if is_done else _MOVES):
             here = (u, value, slope)
-            u, value, slope, rate = _move(ratio, begin, here, power, root, length, generator)
+            u, value, slope, rate = _move(
+                ratio, guided, begin, here, power, root, length, generator
+            )
             length = length * (rate - _ACCEPTED).exp()
         if is_done:
             return Draws(u, evidence)
 
 
 def _move(
-    ratio: LogLikelihood, begin: Normal, here: tuple[Tensor, Tensor, Tensor],
-    power: Tensor, root: Tensor, length: Tensor, generator: torch.Generator,
+    ratio: LogLikelihood, guided: LogLikelihood | None, begin: Normal,
+    here: tuple[Tensor, Tensor, Tensor], power: Tensor, root: Tensor, length: Tensor,
+    generator: torch.Generator,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Move draws of begin x ratio^power, their values and slopes; return them and acceptance.
+
+    The slopes are those of ``guided``, if there is one.
 
     Hamiltonian dynamics have momenta N(0, I) in coordinates in which ``root`` makes draws white.
     """
@@ -156,12 +169,15 @@ def _move(
     new, new_value, new_slope = here
     # Leapfrog steps: half a step of p, steps of u and p by turns, and half a step of p.
     p = p + 0.5 * leap * force(slope, by_prior)
-    for i in range(_LEAPS):
+    leaps = _LEAPS if guided is None else _GUIDED_LEAPS
+    for i in range(leaps):
         new = (new + leap * (root @ p.unsqueeze(-1)).squeeze(-1)).clamp(-_FAR, _FAR)
-        new_value, new_slope = ratio(new)
+        new_value, new_slope = (guided or ratio)(new)
         prior, by_prior = begin.log_density(new)
-        share = 0.5 if i + 1 == _LEAPS else 1.0
+        share = 0.5 if i + 1 == leaps else 1.0
         p = p + share * leap * force(new_slope, by_prior)
+    if guided is not None:
+        new_value, _ = ratio(new, False)
     after = power * new_value + prior - 0.5 * p.square().sum(-1)
     chance = (after - energy).exp().nan_to_num(nan=0.0).clamp_max(1.0)
     taken = torch.rand(chance.shape, generator=generator, dtype=u.dtype).to(u) < chance

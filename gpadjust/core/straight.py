@@ -12,11 +12,12 @@ from torch.quasirandom import SobolEngine
 from gpadjust.core.sample import GROUPS, WIDER, Normal, lower_root
 
 if TYPE_CHECKING:
-    from gpadjust.core.model import GP
+    from gpadjust.core.model import GP, Slopes
+    from gpadjust.core.unknowns import Values
 
 _STEP = 0.02  # of differences, in standard deviations of the posterior
-_CHORD = 10  # steps to a solution with the derivatives at the mode, which cost nothing
-_NEWTON = 20  # further steps, with those at the point
+_BROYDEN = 10  # steps to a solution by derivatives that follow from earlier steps
+_NEWTON = 20  # further steps, by those at the point
 _SOLVED = 1e-5  # standard deviations that a solution may be away
 _MISSED = 1e-3  # standard deviations beyond which a solution is another one
 
@@ -32,7 +33,7 @@ class Straight:
     and other coordinates are themselves. By s the posterior is normal but for the curvature of the
     surface f(u), which is mostly small, however curved ridges are by u (Bates and Watts 1980; the
     map of randomize-then-optimize, Bardsley et al. 2014). A call returns the log density by s over
-    N(s | 0, I), for :func:`sample`, and its gradient but for that of the determinant.
+    N(s | 0, I), for :func:`sample`, without a gradient: :meth:`linear` has one.
     """
 
     def __init__(self, model: GP, start: Normal, choice: int) -> None:
@@ -40,6 +41,8 @@ class Straight:
         self.choice = choice
         self.mode = start.mean  # u_0, of Laplace's approximation
         p = len(model.table.shared)
+        self.values = model.table.values(model.table.with_choice(self.mode.unsqueeze(0), choice))
+        self.tangent = model.physics_with_slopes(self.values, True)
         # White coordinates w of the parameters: u = u_0 + R w.
         self.root = lower_root(start.root[0, -p:])
         mode = self.mode.new_zeros(1, p)
@@ -49,27 +52,31 @@ class Straight:
         self.by = model.precision_times(self.mode.expand(p, 1, -1), J)
         self.within = self.root.mT @ self.root
         self.inverse = torch.linalg.inv(self.by @ J.mT + self.within)
+        # Points that are solved, t, w and (dt / dw)^-1: the mode is the first.
+        self.solved = [mode, mode, torch.eye(p).to(mode).unsqueeze(0)]
         half = torch.linalg.cholesky(0.5 * (self.inverse + self.inverse.mT))
         parameters = WIDER * lower_root(self.root @ half)
         root = torch.block_diag(lower_root(start.root[0, :-p]), parameters)
         self.start = Normal(self.mode, root.unsqueeze(0))
 
-    def __call__(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
-        """Return log densities at s, here named u, over N(s | 0, I), ``N x B``, and gradients."""
-        s = u
+    def __call__(self, s: Tensor, with_gradient: bool = False) -> tuple[Tensor, Tensor]:
+        """Return log densities at s over N(s | 0, I), ``N x B``, and zeros for their gradients."""
         w, is_solved = self._solution(s)
         u = self._at(w, s)
         slopes = self._slopes(w).nan_to_num()
-        # log p(u) + log |du / ds| - log N(s | 0, I)
         log_det = torch.linalg.slogdet(slopes).logabsdet.masked_fill(~is_solved, math.inf)
-        value, slope = self.model.log_likelihood(u, with_gradient, choice=self.choice)
-        value = value + 0.5 * (s.square() - u.square()).sum(-1) - log_det.unsqueeze(-1)
-        p = self.root.shape[-1]
-        # du / ds = R (dt / dw)^-1 R^-1, of parameters.
-        by_t, _ = torch.linalg.solve_ex(slopes.mT, ((slope - u)[:, 0, -p:] @ self.root)[..., None])
-        by_s = torch.linalg.solve_triangular(self.root.mT, by_t[..., 0].mT, upper=True).mT
-        by_s = by_s.unsqueeze(1).nan_to_num() + s[..., -p:]
-        return value, torch.cat([slope[..., :-p], by_s], -1)
+        inverse, _ = torch.linalg.inv_ex(slopes)
+        new = self._white(s), w, inverse.nan_to_num()
+        known = zip(self.solved, new, strict=True)
+        self.solved = [torch.cat([old, each[is_solved]]) for old, each in known]
+        # log p(u) + log |du / ds| - log N(s | 0, I)
+        value, slope = self.model.log_likelihood(u, False, choice=self.choice)
+        return value + 0.5 * (s.square() - u.square()).sum(-1) - log_det.unsqueeze(-1), slope
+
+    def linear(self, s: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
+        """Return log densities and gradients for the linear part of f_p, by which s = u."""
+        density = self.model.log_likelihood
+        return density(s, with_gradient, choice=self.choice, physics=self._linear_physics)
 
     def coordinates(self, s: Tensor) -> Tensor:
         """Return u at s, ``N x B x P``."""
@@ -107,23 +114,30 @@ class Straight:
     def _solution(self, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return w at s, ``N x p``, and whether the equation t(w) = R^-1 (s - u_0) is solved."""
         goal = self._white(s)
-        w, trial, step = goal.clone(), goal.clone(), torch.zeros_like(goal)
+        # From the nearest solved point: w = w_k + B (goal - t_k), with B = (dt / dw)^-1 there.
+        near = torch.cdist(goal, self.solved[0]).argmin(-1)
+        t, w, B = (part[near] for part in self.solved)
+        step = _times(B, goal - t)
+        trial = w + step
         error, share = s.new_full((len(s),), math.inf), s.new_ones(len(s))
         left = torch.arange(len(s), device=s.device)
-        for i in range(_CHORD + _NEWTON):
-            if i == _CHORD:  # Newton's method begins where the chords have led
+        for i in range(_BROYDEN + _NEWTON):
+            if i == _BROYDEN:  # Newton's method begins where Broyden's has led
                 trial[left] = w[left]
                 error[left], share[left] = math.inf, 1.0
-            away = goal[left] - self._straight(trial[left])
-            closer = away.norm(dim=-1) < error[left]
+            here = self._straight(trial[left])
+            if i < _BROYDEN:
+                B[left] = _updated(B[left], trial[left] - w[left], here - t[left])
+            size = (goal[left] - here).norm(dim=-1)
+            closer = size < error[left]
             at, back = left[closer], left[~closer]
-            w[at] = trial[at]
-            error[at] = away[closer].norm(dim=-1)
-            # w <- w + share (dt / dw)^-1 (goal - t), where dt / dw = I at the mode.
-            step[at] = away[closer]
-            if i >= _CHORD:
-                newton, _ = torch.linalg.solve_ex(self._slopes(w[at]), step[at].unsqueeze(-1))
-                step[at] = newton[..., 0].nan_to_num()
+            w[at], t[at], error[at] = trial[at], here[closer], size[closer]
+            # w <- w + share (dt / dw)^-1 (goal - t)
+            if i < _BROYDEN:
+                step[left] = _times(B[left], goal[left] - t[left])
+            else:
+                newton, _ = torch.linalg.inv_ex(self._slopes(w[at]))
+                step[at] = _times(newton, goal[at] - t[at]).nan_to_num()
             share[at] = (4 * share[at]).clamp_max(1.0)
             share[back] /= 4
             left = left[error[left] > _SOLVED]
@@ -141,6 +155,17 @@ class Straight:
         """Return the derivatives dt / dw, ``N x p x p``, at ``N x p``."""
         return self.inverse @ (self.by @ self._mean_slopes(w) + self.within)
 
+    def _linear_physics(self, values: Values, with_slopes: bool) -> tuple[list[Tensor], Slopes]:
+        """Return the linear part of f_p around the mode, and its derivatives."""
+        f, slopes = self.tangent
+        # f_0 + sum_j df / dz_j (z_j - z_0j)
+        for name, parts in slopes.items():
+            key = f"physics.{name}"
+            away = (values[key] - self.values[key]).unsqueeze(-1)
+            f = [y + away * part for y, part in zip(f, parts, strict=True)]
+        n = len(f[0])
+        return f, {key: [y.expand(n, -1, -1) for y in parts] for key, parts in slopes.items()}
+
     def _mean(self, w: Tensor) -> Tensor:
         """Return f at ``N x p``, as ``N x m n``."""
         return self.model.prior_mean(self._at(w, self.mode.expand(len(w), 1, -1)))
@@ -157,3 +182,20 @@ class Straight:
         p = w.shape[-1]
         parameters = self.mode[..., -p:] + (w @ self.root.mT).unsqueeze(1)  # u_0 + R w
         return torch.cat([other[..., :-p], parameters], -1)
+
+
+def _updated(B: Tensor, dw: Tensor, dt: Tensor) -> Tensor:
+    """Return ``N x p x p`` inverse derivatives after a step, ``N x p``, by Broyden's first method.
+
+    They are the nearest ones by which the step dt of t takes the step dw (Broyden 1965).
+    """
+    # B + (dw - B dt) dw^T B / (dw^T B dt)
+    by_w = (dw.unsqueeze(1) @ B)[:, 0]
+    size = (by_w * dt).sum(-1, keepdim=True)
+    change = (dw - _times(B, dt)) / size
+    return B + (change.unsqueeze(-1) * by_w.unsqueeze(1)).nan_to_num(0.0, 0.0, 0.0)
+
+
+def _times(B: Tensor, t: Tensor) -> Tensor:
+    """Return products of ``N x p x p`` and ``N x p``."""
+    return (B @ t.unsqueeze(-1))[..., 0]
