@@ -66,9 +66,8 @@ class Straight:
         slopes = self._slopes(w).nan_to_num()
         log_det = torch.linalg.slogdet(slopes).logabsdet.masked_fill(~is_solved, math.inf)
         inverse, _ = torch.linalg.inv_ex(slopes)
-        new = self._white(s), w, inverse.nan_to_num()
-        known = zip(self.solved, new, strict=True)
-        self.solved = [torch.cat([old, each[is_solved]]) for old, each in known]
+        new = (self._white(s), w, inverse.nan_to_num())
+        self.solved = [torch.cat([a, b[is_solved]]) for a, b in zip(self.solved, new, strict=True)]
         # log p(u) + log |du / ds| - log N(s | 0, I)
         value, slope = self.model.log_likelihood(u, False, choice=self.choice)
         return value + 0.5 * (s.square() - u.square()).sum(-1) - log_det.unsqueeze(-1), slope

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 
 import torch
 from torch import Tensor
@@ -81,11 +82,12 @@ class ODEPhysics(Physics):
         """Return the state after the step, ``N x state_dim``."""
         if len(X) > _ROWS:
             parts = zip(X.split(_ROWS), *(p.rows.split(_ROWS) for p in parameters), strict=True)
-            ends = [
-                self.evaluate(x, *(ParameterValues(self.unknowns, part) for part in rows))
-                for x, *rows in parts
-            ]
-            return torch.cat(ends)
+            with suppress(PhysicsError):  # which all rows at once raise below, with their numbers
+                ends = [
+                    self.evaluate(x, *(ParameterValues(self.unknowns, values) for values in rows))
+                    for x, *rows in parts
+                ]
+                return torch.cat(ends)
         state, action = X[:, : self.state_dim], X[:, self.state_dim :]
 
         def derivative(state: Tensor) -> Tensor:

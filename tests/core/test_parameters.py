@@ -1,10 +1,12 @@
 """Parameters of a physics: narrow posteriors, ridges, several optima, and straight coordinates."""
 
+from functools import partial
+
 import pytest
 import torch
 
-from gpadjust.core import CalibratedPhysics, fit
-from gpadjust.core.sample import around_mode
+from gpadjust.core import CKA, CalibratedPhysics, fit
+from gpadjust.core.sample import around_mode, sample
 from gpadjust.core.straight import Straight
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
 from tests.systems import line, normal
@@ -171,6 +173,54 @@ def test_coordinates_beyond_a_fold_are_missed():
     _, map_ = straight(lambda X, p: (p.p0 + 0.5).square() * X[:, 0], 1)
     u = torch.tensor([-2.6, -2.3, 0.2, 0.4], dtype=torch.float64).reshape(-1, 1, 1)
     assert map_.misses(u).tolist() == [True, True, False, False]
+
+
+def test_a_solution_is_one_however_it_is_found():
+    """From the mode by Newton's method, or by Broyden's from the nearest point of before."""
+    _, map_ = straight(lambda X, p: (p.p0 + p.p1.square() * X[:, 0]).exp(), 2)
+    s = map_.start.mean + (map_.start.root @ normal(40, 2, 1))[..., 0].unsqueeze(1)
+    alone = torch.cat([map_.coordinates(row) for row in s.split(1)])
+    map_(s)
+    near = map_.coordinates(s + 1e-3)
+    torch.testing.assert_close(map_.coordinates(s), alone, rtol=0, atol=1e-4)
+    assert (near - alone).abs().max() < 0.1
+
+
+def test_a_guide_leads_moves_and_decides_nothing():
+    """Of a likelihood N(1, 0.4^2) that it takes for another one, N(0.5, 0.6^2), and no gradient."""
+
+    def density(mean, sd, u, with_gradient=True):
+        away = (u - mean) / sd
+        return -0.5 * away.square().sum(-1), -away / sd
+
+    def likelihood(u, with_gradient=True):
+        assert not with_gradient
+        return density(1.0, 0.4, u)
+
+    like = torch.zeros(1, 2, dtype=torch.float64)
+    draws = [
+        sample(likelihood, like, 400, seed, guide=partial(density, 0.5, 0.6)).u for seed in range(4)
+    ]
+    u = torch.cat(draws)
+    precision = 1 + 1 / 0.4**2
+    assert u.mean().item() == pytest.approx(1 / 0.4**2 / precision, abs=0.03)
+    assert u.std(0).mean().item() == pytest.approx(precision**-0.5, rel=0.08)
+
+
+def test_a_fit_asks_for_few_rows_of_the_physics():
+    """A move costs a solution, the derivatives there and one value: 30 rows or so by 3 unknowns."""
+    rows = []
+
+    def law(X, p):
+        rows.append(len(X))
+        return p.a * (-p.b * X[:, 0]).exp() + p.c
+
+    X = line(45, 0.0, 3.0)
+    unknowns = {name: Unknown(1.0, factor=3.0) for name in "abc"}
+    physics = FunctionPhysics(law, unknowns=unknowns)
+    model = CKA(X, 2 * (-X).exp() + 0.5 + 0.1 * normal(45, 1), physics=physics, nested=False)
+    fit(model)
+    assert sum(rows) < 45 * 35_000  # 26,700 times all
 
 
 def test_where_the_physics_fails_there_is_no_density():

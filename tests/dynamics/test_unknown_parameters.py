@@ -74,8 +74,11 @@ def test_a_state_of_other_priors_is_refused():
 
 
 def test_targets_of_a_physics_at_parameters():
+    calls = []
+
     def turn(X, p):
         """NaN where it turns too far."""
+        calls.append(len(X))
         moved = X[:, :2] + p.speed[:, None]
         return moved.where(p.speed[:, None] < 5.0, torch.nan)
 
@@ -89,9 +92,19 @@ def test_targets_of_a_physics_at_parameters():
     for found in (targets(X, speed), targets.or_nan(X, speed)):
         torch.testing.assert_close(found, expected.unsqueeze(-2).expand(3, 4, 2))
     torch.testing.assert_close(targets(X, speed[0]), expected[0].expand(4, 2))
+    calls.clear()
     found = targets.or_nan(X, torch.tensor([[0.5], [9.0]], dtype=torch.float64))
     assert found.isnan().all(-1).all(-1).tolist() == [False, True]
     torch.testing.assert_close(found[0], expected[0].expand(4, 2))
+    assert calls == [8]  # at once, although some fail
+
+
+def test_a_failure_in_a_column_that_is_not_predicted_is_one():
+    spec = StateSpec(["x", "v"], ["a"], integrated={"x": "v"}, step=0.1)
+    physics = FunctionPhysics(lambda X: torch.stack([(-X[:, 0]).sqrt(), X[:, 1]], -1))
+    X = torch.tensor([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]], dtype=torch.float64)
+    found = TargetPhysics(physics, Targets(spec, "difference")).or_nan(X)
+    assert found.isnan().tolist() == [[True], [False]]
 
 
 # A cart-pole whose masses, length and friction are unknown, after one trial

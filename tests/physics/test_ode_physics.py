@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.linalg import expm
 
-from gpadjust.physics import FormulaPhysics, ODEPhysics, PhysicsError, Unknown
+from gpadjust.physics import FormulaPhysics, FunctionPhysics, ODEPhysics, PhysicsError, Unknown
 from tests.systems import normal, refused
 
 
@@ -75,6 +75,27 @@ def test_a_formula_is_the_function_of_the_same_equations():
     assert physics.name == rates.name
     assert physics.num_outputs == 2  # known at once
     assert physics(torch.ones(0, 3)).shape == (0, 2)
+
+
+def test_many_rows_are_those_of_few_at_once():
+    """Of 70,000 the processor's cache holds a part; what fails has the number that it has."""
+    sizes, limit = [], FunctionPhysics(lambda X: X[:, :1].where(X[:, :1] > -6, torch.nan))
+
+    def rhs(state, action, p):
+        sizes.append(len(state))
+        return -p.k.unsqueeze(-1) * limit.of_rows(state)
+
+    physics = ODEPhysics(rhs, 1.0, 1, substeps=1, unknowns={"k": Unknown(0.5, sd=1.0)})
+    X, k = normal(70_000, 1).clamp(-5, 5), torch.linspace(0.1, 1, 3, dtype=torch.float64)
+    few = torch.stack([physics(X[:100], value) for value in k.unsqueeze(-1)])
+    sizes.clear()
+    many = physics(X, k.unsqueeze(-1))
+    assert max(sizes) <= 30_000
+    torch.testing.assert_close(many[:, :100], few)
+    X[40_001] = -7.0
+    with pytest.raises(PhysicsError) as caught:
+        physics(X)
+    assert caught.value.rows == (40_001,)
 
 
 def test_refusals():
