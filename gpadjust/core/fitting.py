@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 _SMALL = 40  # points: up to these draws begin with the prior
 _MEDIUM, _SHARED = 100, 200  # up to these they are moved; the latter if outputs share numbers
+_FIRST_OF_PRIOR = 16  # draws from the prior for each one that results
+_SCOUTS = 4  # times fewer of these are moved, where they only look for other parts of the posterior
 _FIRST = 4  # draws from Laplace's approximation for each one that results
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
 _OF_NUTS = 640  # draws, a multiple of 16
@@ -248,22 +250,25 @@ def _default_numbers(model: GP) -> tuple[int, int]:
 def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     """Return draws of each nested model; of more than 40 rows of each that is likely enough."""
     is_small = model.targets().shape[-1] <= _SMALL
-    sampled: dict[int, Draws] = {}
-    if is_small:
-        sampled = _from_prior(model, number, seed)
     if model.table.shared:
-        sampled |= _around_ridges(model, sampled, number, seed)
-    elif not is_small:
+        sampled = _around_ridges(model, number, seed)
+    elif is_small:
+        sampled = {
+            k: _from_prior(model, k, number, seed) for k in range(len(model.table.log_prior))
+        }
+    else:
         sampled = _around_modes(model, number, seed)
     with_choice = model.table.with_choice
     return {k: draws._replace(u=with_choice(draws.u, k)) for k, draws in sampled.items()}
 
 
-def _from_prior(model: GP, number: int, seed: int) -> dict[int, Draws]:
-    """Return draws of each nested model that begin with its prior."""
-    like = model.u.detach()[0]
-    choices = range(len(model.table.log_prior))
-    return {k: sample(partial(model.log_likelihood, choice=k), like, number, seed) for k in choices}
+def _from_prior(model: GP, choice: int, number: int, seed: int, every: int = 1) -> Draws:
+    """Return draws of a nested model that begin with its prior, ``every`` times each."""
+    density, like = partial(model.log_likelihood, choice=choice), model.u.detach()[0]
+    size = GROUPS * max(1, number // (GROUPS * every))
+    draws = sample(density, like, size, seed, first=_FIRST_OF_PRIOR * every)
+    repeated = [_evenly(half, number // GROUPS) for half in draws.u.chunk(GROUPS)]
+    return draws._replace(u=torch.cat(repeated))
 
 
 def _around_modes(model: GP, number: int, seed: int) -> dict[int, Draws]:
@@ -276,18 +281,26 @@ def _around_modes(model: GP, number: int, seed: int) -> dict[int, Draws]:
     return sampled
 
 
-def _around_ridges(model: GP, others: dict[int, Draws], number: int, seed: int) -> dict[int, Draws]:
-    """Return the same in coordinates in which ridges are straight, and what others reach beyond."""
-    like, with_moves = model.u.detach()[0], model.targets().shape[-1] <= _SHARED
-    sampled = {}
-    for k, start in _starts(model, seed).items():
+def _around_ridges(model: GP, number: int, seed: int) -> dict[int, Draws]:
+    """Return the same in coordinates in which ridges are straight.
+
+    Of few rows what draws from the prior reach beyond is added; a few of these show whether any do.
+    """
+    like, n = model.u.detach()[0], model.targets().shape[-1]
+    sampled, starts = {}, _starts(model, seed)
+    if n <= _SMALL:
+        choices = range(len(model.table.log_prior))
+        sampled = {k: _from_prior(model, k, number, seed, _SCOUTS) for k in choices}
+    for k, start in starts.items():
         straight = Straight(model, start, k)
         points = straight.points(_FIRST * number, seed)
         start, guide = straight.start, straight.linear
-        draws = sample(straight, like, number, seed, start, _FIRST, with_moves, points, guide)
-        sampled[k] = draws._replace(u=straight.coordinates(draws.u))
-        if k in others:
-            sampled[k] = _joined(sampled[k], others[k], straight.misses(others[k].u))
+        draws = sample(straight, like, number, seed, start, _FIRST, n <= _SHARED, points, guide)
+        draws = draws._replace(u=straight.coordinates(draws.u))
+        if k in sampled and straight.misses(sampled[k].u).any():
+            others = _from_prior(model, k, number, seed)
+            draws = _joined(draws, others, straight.misses(others.u))
+        sampled[k] = draws
     return sampled
 
 

@@ -1,11 +1,12 @@
 """Parameters of a physics: narrow posteriors, ridges, several optima, and straight coordinates."""
 
+import warnings
 from functools import partial
 
 import pytest
 import torch
 
-from gpadjust.core import CKA, CalibratedPhysics, fit
+from gpadjust.core import CKA, CalibratedPhysics, SamplingWarning, fit
 from gpadjust.core.sample import around_mode, sample
 from gpadjust.core.straight import Straight
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
@@ -141,6 +142,16 @@ def test_draws_spread_along_a_curved_ridge(n, noise):
     product_error = noise / model.data.X.square().sum().sqrt()
     assert 0.7 < (a * b).std() / product_error < 1.3
     assert result.parameter_error < 0.15
+
+
+@pytest.mark.parametrize("num_draws", [4, 12])
+def test_few_draws_are_as_many_as_asked_for(num_draws):
+    model, mean, sd = product(12, 0.03)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SamplingWarning)
+        fit(model, num_draws=num_draws)
+    assert len(model.draws) == num_draws
+    assert abs(model.physics_parameters["a"].mean() - mean) < 2 * sd
 
 
 def straight(law, p, seed=0):
