@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _SMALL = 40  # points: up to these draws begin with the prior
 _MEDIUM, _SHARED = 100, 200  # up to these they are moved; the latter if outputs share numbers
 _FIRST_OF_PRIOR = 16  # draws from the prior for each one that results
-_SCOUTS = 4  # times fewer of these are moved, where they only look for other parts of the posterior
+_FEWER = 4  # times, of these draws, where they only look for missed parts of the posterior
 _FIRST = 4  # draws from Laplace's approximation for each one that results
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
 _OF_NUTS = 640  # draws, a multiple of 16
@@ -262,11 +262,11 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     return {k: draws._replace(u=with_choice(draws.u, k)) for k, draws in sampled.items()}
 
 
-def _from_prior(model: GP, choice: int, number: int, seed: int, every: int = 1) -> Draws:
-    """Return draws of a nested model that begin with its prior, ``every`` times each."""
+def _from_prior(model: GP, choice: int, number: int, seed: int, repeats: int = 1) -> Draws:
+    """Return draws of a nested model that begin with its prior, ``repeats`` times each."""
     density, like = partial(model.log_likelihood, choice=choice), model.u.detach()[0]
-    size = GROUPS * max(1, number // (GROUPS * every))
-    draws = sample(density, like, size, seed, first=_FIRST_OF_PRIOR * every)
+    size = GROUPS * max(1, number // (GROUPS * repeats))
+    draws = sample(density, like, size, seed, first=_FIRST_OF_PRIOR * repeats)
     repeated = [_evenly(half, number // GROUPS) for half in draws.u.chunk(GROUPS)]
     return draws._replace(u=torch.cat(repeated))
 
@@ -284,13 +284,13 @@ def _around_modes(model: GP, number: int, seed: int) -> dict[int, Draws]:
 def _around_ridges(model: GP, number: int, seed: int) -> dict[int, Draws]:
     """Return the same in coordinates in which ridges are straight.
 
-    Of few rows what draws from the prior reach beyond is added; a few of these show whether any do.
+    Of few rows what draws from the prior reach beyond is added, if some of a quarter of them do.
     """
     like, n = model.u.detach()[0], model.targets().shape[-1]
     sampled, starts = {}, _starts(model, seed)
     if n <= _SMALL:
         choices = range(len(model.table.log_prior))
-        sampled = {k: _from_prior(model, k, number, seed, _SCOUTS) for k in choices}
+        sampled = {k: _from_prior(model, k, number, seed, _FEWER) for k in choices}
     for k, start in starts.items():
         straight = Straight(model, start, k)
         points = straight.points(_FIRST * number, seed)

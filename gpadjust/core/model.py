@@ -37,8 +37,9 @@ from gpadjust.physics.unknown import Unknowns
 from gpadjust.progress import tick
 
 Slopes = dict[str, list[Tensor]]
-PhysicsAt = Callable[[Values, bool], tuple[list[Tensor], Slopes]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
+PhysicsAt = Callable[[Values, bool], tuple[list[Tensor], Slopes]]
+"""Each physics at the training inputs, ``S x m x n``, and its derivatives if these are wanted."""
 
 _ENTRIES = 150_000  # of covariances that are computed at once and fit into caches
 _STEP = 1e-4  # of differences by parameters of a physics, in coordinates

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _STEP = 0.02  # of differences, in standard deviations of the posterior
 _BROYDEN = 10  # steps to a solution by derivatives that follow from earlier steps
 _NEWTON = 20  # further steps, by those at the point
+_KEPT = 10_000  # solved points, at most, from which others begin
 _SOLVED = 1e-5  # standard deviations that a solution may be away
 _MISSED = 1e-3  # standard deviations beyond which a solution is another one
 
@@ -42,7 +43,8 @@ class Straight:
         self.mode = start.mean  # u_0, of Laplace's approximation
         p = len(model.table.shared)
         self.values = model.table.values(model.table.with_choice(self.mode.unsqueeze(0), choice))
-        self.tangent = model.physics_with_slopes(self.values, True)
+        f, slopes = model.physics_with_slopes(self.values, True)
+        self.f, self.slopes = f, {k: [y.nan_to_num() for y in ys] for k, ys in slopes.items()}
         # White coordinates w of the parameters: u = u_0 + R w.
         self.root = lower_root(start.root[0, -p:])
         mode = self.mode.new_zeros(1, p)
@@ -63,11 +65,13 @@ class Straight:
         """Return log densities at s over N(s | 0, I), ``N x B``, and zeros for their gradients."""
         w, is_solved = self._solution(s)
         u = self._at(w, s)
-        slopes = self._slopes(w).nan_to_num()
-        log_det = torch.linalg.slogdet(slopes).logabsdet.masked_fill(~is_solved, math.inf)
-        inverse, _ = torch.linalg.inv_ex(slopes)
-        new = (self._white(s), w, inverse.nan_to_num())
-        self.solved = [torch.cat([a, b[is_solved]]) for a, b in zip(self.solved, new, strict=True)]
+        slopes = self._slopes(w)
+        log_det = torch.linalg.slogdet(slopes).logabsdet
+        holds = is_solved & log_det.isfinite()
+        log_det = log_det.masked_fill(~holds, math.inf)
+        new = (self._white(s)[holds], w[holds], torch.linalg.inv_ex(slopes[holds]).inverse)
+        both = zip(self.solved, new, strict=True)
+        self.solved = [torch.cat(pair)[-_KEPT:] for pair in both]
         # log p(u) + log |du / ds| - log N(s | 0, I)
         value, slope = self.model.log_likelihood(u, False, choice=self.choice)
         return value + 0.5 * (s.square() - u.square()).sum(-1) - log_det.unsqueeze(-1), slope
@@ -126,7 +130,7 @@ class Straight:
                 error[left], share[left] = math.inf, 1.0
             here = self._straight(trial[left])
             if i < _BROYDEN:
-                B[left] = _updated(B[left], trial[left] - w[left], here - t[left])
+                B[left] = _after_step(B[left], trial[left] - w[left], here - t[left])
             size = (goal[left] - here).norm(dim=-1)
             closer = size < error[left]
             at, back = left[closer], left[~closer]
@@ -156,14 +160,14 @@ class Straight:
 
     def _linear_physics(self, values: Values, with_slopes: bool) -> tuple[list[Tensor], Slopes]:
         """Return the linear part of f_p around the mode, and its derivatives."""
-        f, slopes = self.tangent
+        f = self.f
         # f_0 + sum_j df / dz_j (z_j - z_0j)
-        for name, parts in slopes.items():
+        for name, slopes in self.slopes.items():
             key = f"physics.{name}"
             away = (values[key] - self.values[key]).unsqueeze(-1)
-            f = [y + away * part for y, part in zip(f, parts, strict=True)]
+            f = [y + away * slope for y, slope in zip(f, slopes, strict=True)]
         n = len(f[0])
-        return f, {key: [y.expand(n, -1, -1) for y in parts] for key, parts in slopes.items()}
+        return f, {k: [y.expand(n, -1, -1) for y in ys] for k, ys in self.slopes.items()}
 
     def _mean(self, w: Tensor) -> Tensor:
         """Return f at ``N x p``, as ``N x m n``."""
@@ -183,7 +187,7 @@ class Straight:
         return torch.cat([other[..., :-p], parameters], -1)
 
 
-def _updated(B: Tensor, dw: Tensor, dt: Tensor) -> Tensor:
+def _after_step(B: Tensor, dw: Tensor, dt: Tensor) -> Tensor:
     """Return ``N x p x p`` inverse derivatives after a step, ``N x p``, by Broyden's first method.
 
     They are the nearest ones by which the step dt of t takes the step dw (Broyden 1965).

@@ -180,6 +180,8 @@ class Physics(torch.nn.Module, ABC):
             # Without parameters no frame for the arguments: f_p is called in loops.
             Y = self.evaluate(*(self._arguments(rows) if self.unknowns else (rows,)))
         except PhysicsError as error:
+            if error.inputs is not None:  # those of a physics that this one calls
+                error.partial = None
             if error.partial is not None:
                 error.partial = self._shaped(error.partial, rows)
             raise

@@ -80,7 +80,7 @@ class ODEPhysics(Physics):
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the state after the step, ``N x state_dim``."""
-        if len(X) > _ROWS:
+        if len(X) > _ROWS and not X.is_cuda:
             parts = zip(X.split(_ROWS), *(p.rows.split(_ROWS) for p in parameters), strict=True)
             with suppress(PhysicsError):  # which all rows at once raise below, with their numbers
                 ends = [

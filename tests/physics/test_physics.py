@@ -260,3 +260,15 @@ REFUSED = [
 def test_refusals():
     for case in REFUSED:
         refused(*case)
+
+
+def test_results_of_a_physics_inside_are_not_those_of_the_outer_one():
+    """Also where some rows fail: its others would be taken for outputs in other units."""
+    inner = FunctionPhysics(lambda X: (100 * X[:, :1]).where(X[:, :1] < 2, torch.nan))
+    outer = FunctionPhysics(lambda X: 0 * inner(X))
+    X = torch.rand(3, 1, dtype=torch.float64)
+    assert (outer(X) == 0).all()
+    assert outer.or_nan(torch.cat([X, X + 5])).isnan().all()
+    found = outer.or_nan(torch.stack([X, X + 5]))
+    assert (found[0] == 0).all()
+    assert found[1].isnan().all()
