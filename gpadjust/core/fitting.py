@@ -292,15 +292,17 @@ def _around_ridges(model: GP, number: int, seed: int) -> dict[int, Draws]:
         choices = range(len(model.table.log_prior))
         sampled = {k: _from_prior(model, k, number, seed, _FEWER) for k in choices}
     for k, start in starts.items():
-        straight = Straight(model, start, k)
+        straight, others = Straight(model, start, k, k not in sampled), sampled.get(k)
+        if others is not None:
+            if straight.misses(others.u).any():
+                others = _from_prior(model, k, number, seed)
+            missed = straight.misses(others.u)
         points = straight.points(_FIRST * number, seed)
         start, guide = straight.start, straight.linear
         draws = sample(straight, like, number, seed, start, _FIRST, n <= _SHARED, points, guide)
-        draws = draws._replace(u=straight.coordinates(draws.u))
-        if k in sampled and straight.misses(sampled[k].u).any():
-            others = _from_prior(model, k, number, seed)
-            draws = _joined(draws, others, straight.misses(others.u))
-        sampled[k] = draws
+        sampled[k] = draws._replace(u=straight.coordinates(draws.u))
+        if others is not None:
+            sampled[k] = _joined(sampled[k], others, missed)
     return sampled
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _STEP = 0.02  # of differences, in standard deviations of the posterior
 _BROYDEN = 10  # steps to a solution by derivatives that follow from earlier steps
 _NEWTON = 20  # further steps, by those at the point
+_REACH = 3.0  # standard deviations of the start, beyond the root of the number of parameters
 _KEPT = 10_000  # solved points, at most, from which others begin
 _SOLVED = 1e-5  # standard deviations that a solution may be away
 _MISSED = 1e-3  # standard deviations beyond which a solution is another one
@@ -34,10 +35,11 @@ class Straight:
     and other coordinates are themselves. By s the posterior is normal but for the curvature of the
     surface f(u), which is mostly small, however curved ridges are by u (Bates and Watts 1980; the
     map of randomize-then-optimize, Bardsley et al. 2014). A call returns the log density by s over
-    N(s | 0, I), for :func:`sample`, without a gradient: :meth:`linear` has one.
+    N(s | 0, I), for :func:`sample`, without a gradient: :meth:`linear` has one. Unless it is alone,
+    other draws are those of parameters that a normal distribution hardly reaches from the mode.
     """
 
-    def __init__(self, model: GP, start: Normal, choice: int) -> None:
+    def __init__(self, model: GP, start: Normal, choice: int, is_alone: bool = True) -> None:
         self.model = model
         self.choice = choice
         self.mode = start.mean  # u_0, of Laplace's approximation
@@ -60,6 +62,7 @@ class Straight:
         parameters = WIDER * lower_root(self.root @ half)
         root = torch.block_diag(lower_root(start.root[0, :-p]), parameters)
         self.start = Normal(self.mode, root.unsqueeze(0))
+        self.reach = math.inf if is_alone else math.sqrt(p) + _REACH
 
     def __call__(self, s: Tensor, with_gradient: bool = False) -> tuple[Tensor, Tensor]:
         """Return log densities at s over N(s | 0, I), ``N x B``, and zeros for their gradients."""
@@ -67,7 +70,7 @@ class Straight:
         u = self._at(w, s)
         slopes = self._slopes(w)
         log_det = torch.linalg.slogdet(slopes).logabsdet
-        holds = is_solved & log_det.isfinite()
+        holds = is_solved & log_det.isfinite() & ~self._is_far(s)
         log_det = log_det.masked_fill(~holds, math.inf)
         new = (self._white(s)[holds], w[holds], torch.linalg.inv_ex(slopes[holds]).inverse)
         both = zip(self.solved, new, strict=True)
@@ -102,11 +105,21 @@ class Straight:
         return torch.cat(groups).unsqueeze(1)
 
     def misses(self, u: Tensor) -> Tensor:
-        """Return whether u, ``N x B x P``, are not the coordinates of any s: ``N``."""
+        """Return whether u, ``N x B x P``, are not the coordinates of any s: ``N``.
+
+        They are found from the points that are solved, which before the first call is the mode.
+        """
         w = self._white(u)
         s = self._at(self._straight(w), u)
         away = self._white(self.coordinates(s)) - w
-        return ~(away.norm(dim=-1) < _MISSED)
+        return ~(away.norm(dim=-1) < _MISSED) | self._is_far(s)
+
+    def _is_far(self, s: Tensor) -> Tensor:
+        """Return whether parameters at s are beyond the reach of the start: ``N``."""
+        p = self.root.shape[-1]
+        away = (s[:, 0, -p:] - self.mode[:, -p:]).mT
+        root = self.start.root[0, -p:, -p:]
+        return torch.linalg.solve_triangular(root, away, upper=False).norm(dim=0) > self.reach
 
     def _white(self, u: Tensor) -> Tensor:
         """Return white coordinates of the parameters, ``N x p``."""
