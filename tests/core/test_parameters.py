@@ -176,13 +176,13 @@ def test_few_draws_are_as_many_as_asked_for(num_draws):
     assert abs(model.physics_parameters["a"].mean() - mean) < 2 * sd
 
 
-def straight(law, p, seed=0):
+def straight(law, p, seed=0, is_alone=True):
     X = line(15)
     physics = FunctionPhysics(law, unknowns={f"p{i}": Unknown(0.5, sd=1.0) for i in range(p)})
     model = CalibratedPhysics(X, X + 0.1 * normal(15, 1, seed=seed), 0.1**2, physics=physics)
     mode = torch.full_like(model.u.detach()[0], 0.3)
     start, _ = around_mode(model.log_likelihood, mode)
-    return model, Straight(model, start, 0)
+    return model, Straight(model, start, 0, is_alone)
 
 
 def test_coordinates_of_a_linear_law_are_its_own():
@@ -206,6 +206,16 @@ def test_coordinates_beyond_a_fold_are_missed():
     _, map_ = straight(lambda X, p: (p.p0 + 0.5).square() * X[:, 0], 1)
     u = torch.tensor([-2.6, -2.3, 0.2, 0.4], dtype=torch.float64).reshape(-1, 1, 1)
     assert map_.misses(u).tolist() == [True, True, False, False]
+
+
+def test_a_point_is_either_within_reach_or_missed():
+    for is_alone in (True, False):
+        _, map_ = straight(lambda X, p: p.p0 + p.p1 * X[:, 0], 2, is_alone=is_alone)
+        away = torch.tensor([[3.0, 0.0], [0.0, 4.3], [0.0, 4.5], [9.0, 9.0]]).double()
+        s = map_.mode + (away @ map_.start.root[0].mT).unsqueeze(1)
+        beyond = [False, False, not is_alone, not is_alone]  # sqrt(2) + 3
+        assert map_.misses(s).tolist() == beyond
+        assert (map_(s)[0] == -torch.inf).flatten().tolist() == beyond
 
 
 def test_no_density_at_the_edge_of_failure():
