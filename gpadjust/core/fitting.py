@@ -287,12 +287,14 @@ def _around_ridges(model: GP, number: int, seed: int) -> dict[int, Draws]:
     Of few rows what draws from the prior reach beyond is added, if some of a quarter of them do.
     """
     like, n = model.u.detach()[0], model.targets().shape[-1]
-    sampled, starts = {}, _starts(model, seed)
+    sampled = dict[int, Draws]()
+    starts = _starts(model, seed)
     if n <= _SMALL:
         choices = range(len(model.table.log_prior))
         sampled = {k: _from_prior(model, k, number, seed, _FEWER) for k in choices}
     for k, start in starts.items():
-        straight, others = Straight(model, start, k, k not in sampled), sampled.get(k)
+        straight = Straight(model, start, k, k not in sampled)
+        others = sampled.get(k)
         if others is not None:
             if straight.misses(others.u).any():
                 others = _from_prior(model, k, number, seed)

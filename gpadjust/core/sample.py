@@ -97,7 +97,7 @@ def sample(
         b, by_b = start.log_density(u)
         return value + a - b, slope + by_a - by_b
 
-    guided = None if guide is None else partial(ratio, of=guide)
+    guided = guide and partial(ratio, of=guide)
     if points is None:
         points = standard_normal((first * number, *shape), generator, like)
     u = begin.mean + (begin.root @ points.unsqueeze(-1)).squeeze(-1)

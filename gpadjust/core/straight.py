@@ -45,8 +45,8 @@ class Straight:
         self.mode = start.mean  # u_0, of Laplace's approximation
         p = len(model.table.shared)
         self.values = model.table.values(model.table.with_choice(self.mode.unsqueeze(0), choice))
-        f, slopes = model.physics_with_slopes(self.values, True)
-        self.f, self.slopes = f, {k: [y.nan_to_num() for y in ys] for k, ys in slopes.items()}
+        self.f, slopes = model.physics_with_slopes(self.values, True)
+        self.slopes = {name: [y.nan_to_num() for y in ys] for name, ys in slopes.items()}
         # White coordinates w of the parameters: u = u_0 + R w.
         self.root = lower_root(start.root[0, -p:])
         mode = self.mode.new_zeros(1, p)
@@ -62,7 +62,9 @@ class Straight:
         parameters = WIDER * lower_root(self.root @ half)
         root = torch.block_diag(lower_root(start.root[0, :-p]), parameters)
         self.start = Normal(self.mode, root.unsqueeze(0))
-        self.reach = math.inf if is_alone else math.sqrt(p) + _REACH
+        self.reach = math.inf
+        if not is_alone:
+            self.reach = math.sqrt(p) + _REACH
 
     def __call__(self, s: Tensor, with_gradient: bool = False) -> tuple[Tensor, Tensor]:
         """Return log densities at s over N(s | 0, I), ``N x B``, and zeros for their gradients."""
@@ -147,7 +149,9 @@ class Straight:
             size = (goal[left] - here).norm(dim=-1)
             closer = size < error[left]
             at, back = left[closer], left[~closer]
-            w[at], t[at], error[at] = trial[at], here[closer], size[closer]
+            w[at] = trial[at]
+            t[at] = here[closer]
+            error[at] = size[closer]
             # w <- w + share (dt / dw)^-1 (goal - t)
             if i < _BROYDEN:
                 step[left] = _times(B[left], goal[left] - t[left])
