@@ -1,13 +1,12 @@
 """Parameters of a physics: narrow posteriors, ridges, several optima, and straight coordinates."""
 
-import math
 import warnings
 from functools import partial
 
 import pytest
 import torch
 
-from gpadjust.core import CKA, CalibratedPhysics, SamplingWarning, fit
+from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, SamplingWarning, fit
 from gpadjust.core.sample import around_mode, sample
 from gpadjust.core.straight import Straight, _after_step
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
@@ -116,25 +115,21 @@ def test_draws_go_beyond_a_fold():
     assert square.item() == pytest.approx(1, abs=0.25)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_draws_reach_a_long_tail(seed):
-    """Of a rate that may be as large as the prior allows: all data are saturated but for noise."""
-    X, noise = line(8, 1.0, 2.0), 0.3
-    physics = FormulaPhysics("1 - exp(-a * x)", ["x"], unknowns={"a": Unknown(1.0, factor=5.0)})
-    model = CalibratedPhysics(X, 0.95 + noise * normal(8, 1, seed=4), noise**2, physics=physics)
-    result = fit(model, seed=seed)
-    u = torch.linspace(-8, 8, 8001, dtype=torch.float64)
-    a = physics.unknowns.to_values(u.unsqueeze(-1))
-    misfit = (model.data.Y.mT - 1 + (-a * X.mT).exp()).square().sum(-1)
-    log = -0.5 * misfit / noise**2 - 0.5 * u.square()
-    weights = log.softmax(0)
-    size = log.logsumexp(0) + math.log(u[1] - u[0]) - 0.5 * math.log(2 * torch.pi)
-    evidence = size - 8 * math.log(noise * math.sqrt(2 * torch.pi))
-    assert result.log_evidence.item() == pytest.approx(evidence.item(), abs=0.08)
-    found = model.physics_parameters.coordinates[:, 0]
-    assert abs(found.mean() - (weights * u).sum()) < 0.1
-    for end in (0.5, 1.5, 2.5):
-        assert abs((found > end).double().mean() - weights[u > end].sum()) < 0.05
+def test_a_parameter_that_a_delta_takes_the_place_of_keeps_its_prior():
+    """A height, of which a free delta has an offset; beside many draws from the prior."""
+    X = line(10, 0.0, 1.5)
+    unknowns = {"h": Unknown(50.0, sd=20.0), "g": Unknown(9.0, sd=2.0)}
+    physics = FormulaPhysics("h - g*x**2/2", ["x"], unknowns=unknowns)
+    Y = 52 - 4.9 * X**2 + 0.4 * X**3 + 0.05 * normal(10, 1, seed=3)
+    model = PhysicsMeanGP(X, Y, physics=physics)
+    fit(model)
+    low, high = model.physics_parameters.interval()
+    u = normal(400_000, *model.u.shape[1:])
+    weights = torch.cat([model.log_likelihood(part, False)[0] for part in u.split(20_000)])
+    height, order = model.physics_parameters_at(u).draws[:, 0].sort()
+    share = weights[order, 0].softmax(0).cumsum(0)
+    exact = [height[(share < end).sum()] for end in (0.025, 0.975)]
+    assert ((high - low)[0] / (exact[1] - exact[0])).item() == pytest.approx(1, abs=0.25)
 
 
 def product(n, noise):
