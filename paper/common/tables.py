@@ -113,7 +113,7 @@ def mean_error(
     def cell(runs: pd.DataFrame) -> str:
         found = Difference.of(pd.to_numeric(part_of(runs, **only)[value]))
         text = number(found.mean, form)
-        if found.n > 1 and math.isfinite(found.mean):
+        if not math.isnan(found.error):
             text += f" ± {found.error:{error or form}}"
         return text + (f" ({found.n})" if counted and found.n > 1 else "")
 

@@ -26,7 +26,7 @@ class Difference:
     """The mean of paired differences, with what it may be."""
 
     mean: float  # the mean
-    error: float  # its standard error; nan of fewer than two
+    error: float  # its standard error; nan of fewer than two, or of infinite ones
     n: int  # of how many differences it is
 
     @classmethod
@@ -35,7 +35,8 @@ class Difference:
         found = np.asarray(values, dtype=float)
         found = found[~np.isnan(found)]
         mean = float(found.mean()) if len(found) else np.nan
-        return cls(mean, float(stats.sem(found)) if len(found) > 1 else np.nan, len(found))
+        has_error = len(found) > 1 and np.isfinite(found).all()
+        return cls(mean, float(stats.sem(found)) if has_error else np.nan, len(found))
 
     def __truediv__(self, scale: float) -> Difference:
         return Difference(self.mean / scale, self.error / abs(scale), self.n)
