@@ -178,16 +178,12 @@ def fit(
 
 
 def _most_likely(model: GP, num_draws: int | None, seed: int) -> FitResult:
-    """Set the most likely coordinates of the whole model; a number of draws has no effect.
-
-    A mode of few observations may be so narrow that only a search from draws around it finds it.
-    """
-    others = None
-    if model.targets().shape[-1] <= _SMALL and not model.table.shared:
-        density, like = partial(model.log_likelihood, choice=0), model.u.detach()[0]
-        draws = sample(density, like, _BEFORE_SEARCH, seed, first=_FIRST_OF_SEARCH)
-        others = _sorted(model, 0, draws.u)[: _SEARCHES // 2]
-    mode = modes(model, 0, seed, is_precise=True, others=others)[:1]
+    """Set the most likely coordinates of the whole model; a number of draws has no effect."""
+    first, *others = _parts(model, seed)
+    ends = modes(first, 0, seed, True)
+    for part in others:
+        ends = modes(part, 0, seed, True, ends)
+    mode = ends[:1]
     if model.table.shared:
         start, _ = around_mode(partial(model.log_likelihood, choice=0), mode[0], True)
         mode = model.table.with_choice(start.mean.unsqueeze(0), 0)
@@ -284,13 +280,15 @@ def _around_modes(model: GP, number: int, seed: int) -> dict[int, Draws]:
 def _around_ridges(model: GP, number: int, seed: int) -> dict[int, Draws]:
     """Return the same in coordinates in which ridges are straight.
 
-    Of few rows what draws from the prior reach beyond is added, if some of a quarter of them do.
+    Of few rows (of more beside a delta, which may take a parameter's place) what draws from the
+    prior reach beyond is added, if some of a quarter of them do.
     """
     like, n = model.u.detach()[0], model.targets().shape[-1]
     sampled = dict[int, Draws]()
     starts = _starts(model, seed)
-    if n <= _SMALL:
-        choices = range(len(model.table.log_prior))
+    varies = any(term.varies for term in model.terms)
+    if n <= (_MEDIUM if varies else _SMALL):
+        choices = range(len(model.table.log_prior)) if n <= _SMALL else starts
         sampled = {k: _from_prior(model, k, number, seed, _FEWER) for k in choices}
     for k, start in starts.items():
         straight = Straight(model, start, k, k not in sampled)
@@ -334,7 +332,7 @@ def _evenly(u: Tensor, number: int) -> Tensor:
 def _starts(model: GP, seed: int) -> dict[int, Normal]:
     """Return Laplace's approximation of each nested model that is likely enough.
 
-    Modes are searched by some of the rows first, then from there by four times as many, up to all.
+    Modes are sought by some of the rows first, then from there by four times as many, up to all.
     A nested model that is unlikely by some of them is left out: that its odds recover has a
     probability of the odds at most (Ville's inequality).
     """
@@ -344,11 +342,8 @@ def _starts(model: GP, seed: int) -> dict[int, Normal]:
     for part in _parts(model, seed):
         starts = {}
         for k in likely:
+            ends[k] = modes(part, k, seed, is_precise, ends.get(k))
             density = partial(part.log_likelihood, choice=k)
-            if k in ends:
-                ends[k] = _sorted(part, k, maximise(density, ends[k], is_precise))
-            else:
-                ends[k] = modes(part, k, seed, is_precise)
             starts[k] = around_mode(density, ends[k][0], is_precise)
         weights = _weights(model, {k: log.unsqueeze(0) for k, (_, log) in starts.items()})
         likely = [k for k in starts if bool((weights[k] > _SELDOM).any())]
@@ -367,31 +362,37 @@ def _parts(model: GP, seed: int) -> list[GP]:
 
 
 def modes(
-    model: GP, choice: int, seed: int, is_precise: bool = False, others: Tensor | None = None
+    model: GP, choice: int, seed: int, is_precise: bool = False, before: Tensor | None = None
 ) -> Tensor:
     """Return the most likely end of some searches, or two that are nearly as likely, ``2 x B x P``.
 
-    Searches begin with the most likely of some draws from the prior, and the medians of the priors;
-    some of them with others, ``N x B x P``, if these are given.
+    Searches begin at the ends of those by fewer rows, if there were any; else with the most likely
+    of some draws from the prior, and the medians of the priors; with parameters of a physics also
+    with the best ones; precise ones of few rows also with draws from the posterior, as a mode of
+    these may be so narrow that no other search finds it.
     """
-    like = model.u.detach()[0]
+    density, like = partial(model.log_likelihood, choice=choice), model.u.detach()[0]
+    if before is not None:
+        return _sorted(model, choice, maximise(density, before, is_precise))
+    shared = len(model.table.shared)
     number = max(16, 6400 // max(len(model.data.Y), 25))
     generator = torch.Generator().manual_seed(seed)
     u = standard_normal((number, *like.shape), generator, like)
     searches = _SEARCHES // 2 if choice else _SEARCHES
-    if others is None:
-        others = u[:0]
+    others = u[:0]
+    if is_precise and not shared and model.targets().shape[-1] <= _SMALL:
+        draws = sample(density, like, _BEFORE_SEARCH, seed, first=_FIRST_OF_SEARCH)
+        others = _sorted(model, choice, draws.u)[: _SEARCHES // 2]
     likely = _sorted(model, choice, u)[: searches - 1 - len(others)]
     begins = torch.cat([others, likely, torch.zeros_like(u[:1])])
-    if model.table.shared:
+    if shared:
         begins[-2] = _with_least_squares(model, choice, u)
-    most = _STEPS_OF_SHARED if is_precise and model.table.shared else _STEPS
-    ends = maximise(partial(model.log_likelihood, choice=choice), begins, is_precise, most)
-    ends = _sorted(model, choice, ends)
-    density = _log_density(model, choice, ends)
+    most = _STEPS_OF_SHARED if is_precise and shared else _STEPS
+    ends = _sorted(model, choice, maximise(density, begins, is_precise, most))
+    log_density = _log_density(model, choice, ends)
     is_near = (ends - ends[0]).abs().amax(-1) < _NEAR
-    rival, second = density.masked_fill(is_near, -math.inf).max(0)
-    if not (rival > density[0] - _LESS_LIKELY).any():
+    rival, second = log_density.masked_fill(is_near, -math.inf).max(0)
+    if not (rival > log_density[0] - _LESS_LIKELY).any():
         return ends[:1]
     return torch.stack([ends[0], ends[second, torch.arange(len(like))]])
 
