@@ -107,6 +107,7 @@ def fit(
     ``"bayes"`` draws all unknown numbers from their posterior: by sequential Monte Carlo from the
     prior up to 40 points, from Laplace's approximation beyond; beyond 100 points (200 if outputs
     share unknown numbers, as parameters of a physics) its draws are weighted once and not moved.
+    Where parameters of a physics are beside a delta, the prior's draws count up to 100 points, too.
     Nested models are pooled by their posterior probabilities. ``"map"`` finds the most likely
     numbers of the whole model. ``"nuts"`` is a slow reference without nested models: Pyro's NUTS in
     four chains that also jump around draws of the default fit. A bar shows progress after 5 s.
@@ -182,7 +183,7 @@ def _most_likely(model: GP, num_draws: int | None, seed: int) -> FitResult:
     first, *others = _parts(model, seed)
     ends = modes(first, 0, seed, True)
     for part in others:
-        ends = modes(part, 0, seed, True, ends)
+        ends = _rivals(part, 0, modes(part, 0, seed, True, ends))
     mode = ends[:1]
     if model.table.shared:
         start, _ = around_mode(partial(model.log_likelihood, choice=0), mode[0], True)
@@ -388,13 +389,18 @@ def modes(
     if shared:
         begins[-2] = _with_least_squares(model, choice, u)
     most = _STEPS_OF_SHARED if is_precise and shared else _STEPS
-    ends = _sorted(model, choice, maximise(density, begins, is_precise, most))
+    ends = maximise(density, begins, is_precise, most)
+    return _rivals(model, choice, _sorted(model, choice, ends))
+
+
+def _rivals(model: GP, choice: int, ends: Tensor) -> Tensor:
+    """Return the first of sorted ends ``N x B x P`` of searches, or two, as :func:`modes` does."""
     log_density = _log_density(model, choice, ends)
     is_near = (ends - ends[0]).abs().amax(-1) < _NEAR
     rival, second = log_density.masked_fill(is_near, -math.inf).max(0)
     if not (rival > log_density[0] - _LESS_LIKELY).any():
         return ends[:1]
-    return torch.stack([ends[0], ends[second, torch.arange(len(like))]])
+    return torch.stack([ends[0], ends[second, torch.arange(len(second))]])
 
 
 def _with_least_squares(model: GP, choice: int, u: Tensor) -> Tensor:
