@@ -8,6 +8,7 @@ import torch
 
 from gpadjust import core
 from gpadjust.core import CKA, GP, Choice, LogNormal, SamplingWarning, Term, ZeroMeanGP, fit
+from gpadjust.core.fitting import modes
 from gpadjust.core.sample import around_mode
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests import systems
@@ -67,6 +68,26 @@ def test_a_point_fit_finds_a_narrow_mode(seed):
     with torch.no_grad():
         error = (model.posterior(line).mean - truth(line)).square().mean().sqrt()
     assert error < 0.01
+
+
+def test_a_point_fit_seeks_modes_by_few_rows_first(monkeypatch):
+    """It is as likely as by all rows from the beginning, and asks less often for their density."""
+    X, noise = noisy(130, noise=0.02)
+    model = CKA(X, 2 * wave(X) + X[:, :1] + noise, physics=wave)
+    rows, density = [], GP.log_likelihood
+
+    def counted(model, u, *args, **options):
+        rows.append(len(u) * len(model.data.Y) ** 3)
+        return density(model, u, *args, **options)
+
+    monkeypatch.setattr(GP, "log_likelihood", counted)
+    found = modes(model, 0, seed=0, is_precise=True)
+    work = sum(rows)
+    fit(model, "map")
+    both = torch.cat([found[:1], model.u.detach()])
+    logs = density(model, both, False, choice=0)[0] - 0.5 * both.square().sum(-1)
+    assert logs[1, 0] > logs[0, 0] - 0.1
+    assert sum(rows) < 1.3 * work
 
 
 @pytest.mark.parametrize("n", [8, 60])
