@@ -181,14 +181,13 @@ def fit(
 def _most_likely(model: GP, num_draws: int | None, seed: int) -> FitResult:
     """Set the most likely coordinates of the whole model; a number of draws has no effect."""
     first, *others = _parts(model, seed)
-    ends = modes(first, 0, seed, True)
+    mode = modes(first, 0, seed, True)
     for part in others:
-        ends = _rivals(part, 0, modes(part, 0, seed, True, ends))
-    mode = ends[:1]
+        mode = _rivals(part, 0, modes(part, 0, seed, True, mode))
     if model.table.shared:
         start, _ = around_mode(partial(model.log_likelihood, choice=0), mode[0], True)
         mode = model.table.with_choice(start.mean.unsqueeze(0), 0)
-    model.set_draws(mode)
+    model.set_draws(mode[:1])
     return FitResult("map")
 
 
@@ -285,12 +284,12 @@ def _around_ridges(model: GP, number: int, seed: int) -> dict[int, Draws]:
     prior reach beyond is added, if some of a quarter of them do.
     """
     like, n = model.u.detach()[0], model.targets().shape[-1]
-    sampled = dict[int, Draws]()
     starts = _starts(model, seed)
     varies = any(term.varies for term in model.terms)
-    if n <= (_MEDIUM if varies else _SMALL):
-        choices = range(len(model.table.log_prior)) if n <= _SMALL else starts
-        sampled = {k: _from_prior(model, k, number, seed, _FEWER) for k in choices}
+    choices = [*starts] if varies and n <= _MEDIUM else []
+    if n <= _SMALL:
+        choices = [*range(len(model.table.log_prior))]
+    sampled = {k: _from_prior(model, k, number, seed, _FEWER) for k in choices}
     for k, start in starts.items():
         straight = Straight(model, start, k, k not in sampled)
         others = sampled.get(k)
@@ -367,10 +366,10 @@ def modes(
 ) -> Tensor:
     """Return the most likely end of some searches, or two that are nearly as likely, ``2 x B x P``.
 
-    Searches begin at the ends of those by fewer rows, if there were any; else with the most likely
-    of some draws from the prior, and the medians of the priors; with parameters of a physics also
-    with the best ones; precise ones of few rows also with draws from the posterior, as a mode of
-    these may be so narrow that no other search finds it.
+    Searches begin with those ``before``, of fewer rows; else with the most likely of some draws
+    from the prior, and the medians of the priors; with parameters of a physics also the best ones;
+    precise ones of few rows also with draws from the posterior, of which a mode may be too narrow
+    for others to find.
     """
     density, like = partial(model.log_likelihood, choice=choice), model.u.detach()[0]
     if before is not None:
