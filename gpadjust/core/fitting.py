@@ -18,6 +18,7 @@ from gpadjust.core.nuts import CHAINS, nuts
 from gpadjust.core.sample import GROUPS, Draws, Normal, around_mode, maximise, sample
 from gpadjust.core.straight import Straight
 from gpadjust.core.unknowns import standard_normal
+from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.least_squares import least_squares_fit
 from gpadjust.progress import long_work
 from gpadjust.threads import threads_for
@@ -128,6 +129,7 @@ def fit(
         ValueError: If the method or number of draws is unknown, or the data are a batch; of NUTS
             also if there are nested models or no density.
         TypeError: If it is not a model of this library, or num_draws is not a whole number.
+        PhysicsError: If the physics fails by nearly all draws of its parameters.
         ImportError: Of NUTS, if Pyro is not installed.
 
     Example:
@@ -254,6 +256,11 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
         }
     else:
         sampled = _around_modes(model, number, seed)
+    if not any(draws.log_evidence.isfinite().all() for draws in sampled.values()):
+        raise PhysicsError(
+            "The physics fails by nearly all draws of its parameters. Expected it to hold at those "
+            "that the priors allow; narrow these: Unknown(1.0, sd=0.1, bounds=(0.8, 1.2))."
+        )
     with_choice = model.table.with_choice
     return {k: draws._replace(u=with_choice(draws.u, k)) for k, draws in sampled.items()}
 
@@ -289,7 +296,9 @@ def _around_ridges(model: GP, number: int, seed: int) -> dict[int, Draws]:
     choices = [*starts] if varies and n <= _MEDIUM else []
     if n <= _SMALL:
         choices = [*range(len(model.table.log_prior))]
-    sampled = {k: _from_prior(model, k, number, seed, _FEWER) for k in choices}
+    begun = {k: _from_prior(model, k, number, seed, _FEWER) for k in choices}
+    # Without any in a group, where f_p fails by nearly all of the prior, none counts.
+    sampled = {k: draws for k, draws in begun.items() if draws.log_evidence.isfinite().all()}
     for k, start in starts.items():
         straight = Straight(model, start, k, k not in sampled)
         others = sampled.get(k)

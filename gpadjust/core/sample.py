@@ -66,7 +66,7 @@ def sample(
     Draws of a start, ``first`` times as many as result, are weighted by a power of the ratio of the
     posterior to the start, as large as half of them still count, resampled and moved by Hamiltonian
     Monte Carlo; the power rises until it is 1. They are not moved if more of them count than
-    result.
+    result. The evidence is zero if L is, at all draws of a group.
 
     Args:
         log_likelihood: L of ``B`` problems.
@@ -103,8 +103,12 @@ def sample(
     u = begin.mean + (begin.root @ points.unsqueeze(-1)).squeeze(-1)
     value, slope = ratio(u, False)
     power = like.new_zeros(shape[0])
-    least = _SHARE * number if with_moves else 0.0  # draws that count
     evidence = like.new_zeros(GROUPS, shape[0])
+    possible = int(value.isfinite().reshape(GROUPS, -1, shape[0]).sum(1).min())
+    if not possible:
+        return Draws(u[:number], evidence - math.inf)
+    # Draws that count, at least; in the first step no more than have a likelihood.
+    least = min(_SHARE * number, possible) if with_moves else 0.0
     length = torch.full_like(power, _FIRST_LENGTH)
     problems = torch.arange(shape[0], device=like.device)
     is_first = True
@@ -132,6 +136,7 @@ def sample(
             else:
                 slope = guided(u)[1]
             is_first = False
+            least = _SHARE * number
         is_done = bool((power >= 1).all())
         for _ in range(_LAST_MOVES if is_done else _MOVES):
             here = (u, value, slope)

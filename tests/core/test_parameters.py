@@ -9,7 +9,7 @@ import torch
 from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, SamplingWarning, fit
 from gpadjust.core.sample import around_mode, sample
 from gpadjust.core.straight import Straight, _after_step
-from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
+from gpadjust.physics import FormulaPhysics, FunctionPhysics, PhysicsError, Unknown
 from tests.systems import line, normal
 
 
@@ -318,6 +318,28 @@ def test_where_the_physics_fails_there_is_no_density():
     u = torch.full_like(model.u.detach(), -9.0)
     for with_gradient in (False, True):
         assert model.log_likelihood(u, with_gradient)[0].item() == -torch.inf
+
+
+@pytest.mark.parametrize("n", [12, 60])
+@pytest.mark.parametrize("width", [1.0, 0.1, 0.003])
+def test_a_physics_that_fails_by_most_of_its_prior(n, width):
+    """The fit ends, by draws where it holds or by an error."""
+    X = line(n)
+
+    def law(X, p):
+        outside = ((p.a - 1).abs() > width) | ((p.b - 1).abs() > width)
+        return (p.a * X[:, 0] + p.b).masked_fill(outside, torch.nan)
+
+    unknowns = {name: Unknown(1.0, sd=1.0) for name in "ab"}
+    physics = FunctionPhysics(law, unknowns=unknowns)
+    model = PhysicsMeanGP(X, 1 + X + 0.05 * normal(n, 1), physics=physics)
+    if width < 0.01:
+        with pytest.raises(PhysicsError, match="bounds"):
+            fit(model)
+        return
+    fit(model)
+    found = model.physics_parameters
+    assert all(((found[name] - 1).abs() <= width).all() for name in "ab")
 
 
 def test_a_physics_that_fails_is_impossible_with_and_without_a_gradient():
