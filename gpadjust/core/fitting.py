@@ -108,7 +108,8 @@ def fit(
     ``"bayes"`` draws all unknown numbers from their posterior: by sequential Monte Carlo from the
     prior up to 40 points, from Laplace's approximation beyond; beyond 100 points (200 if outputs
     share unknown numbers, as parameters of a physics) its draws are weighted once and not moved.
-    Where parameters of a physics are beside a delta, the prior's draws count up to 100 points, too.
+    Where a physics has unknown parameters and a term varies, what draws from the prior reach beyond
+    is added up to 100 points.
     Nested models are pooled by their posterior probabilities. ``"map"`` finds the most likely
     numbers of the whole model. ``"nuts"`` is a slow reference without nested models: Pyro's NUTS in
     four chains that also jump around draws of the default fit. A bar shows progress after 5 s.
@@ -287,8 +288,8 @@ def _around_modes(model: GP, number: int, seed: int) -> dict[int, Draws]:
 def _around_ridges(model: GP, number: int, seed: int) -> dict[int, Draws]:
     """Return the same in coordinates in which ridges are straight.
 
-    Of few rows (of more beside a delta, which may take a parameter's place) what draws from the
-    prior reach beyond is added, if some of a quarter of them do.
+    What draws from the prior reach beyond is added, if some of a quarter of them do: of few rows,
+    and of more where a term varies, such as delta, which may take a parameter's place.
     """
     like, n = model.u.detach()[0], model.targets().shape[-1]
     starts = _starts(model, seed)
@@ -296,9 +297,11 @@ def _around_ridges(model: GP, number: int, seed: int) -> dict[int, Draws]:
     choices = [*starts] if varies and n <= _MEDIUM else []
     if n <= _SMALL:
         choices = [*range(len(model.table.log_prior))]
-    begun = {k: _from_prior(model, k, number, seed, _FEWER) for k in choices}
-    # Without any in a group, where f_p fails by nearly all of the prior, none counts.
-    sampled = {k: draws for k, draws in begun.items() if draws.log_evidence.isfinite().all()}
+    sampled = {}
+    for k in choices:
+        draws = _from_prior(model, k, number, seed, _FEWER)
+        if draws.log_evidence.isfinite().all():  # not if f_p fails by nearly all of the prior
+            sampled[k] = draws
     for k, start in starts.items():
         straight = Straight(model, start, k, k not in sampled)
         others = sampled.get(k)
@@ -375,21 +378,22 @@ def modes(
 ) -> Tensor:
     """Return the most likely end of some searches, or two that are nearly as likely, ``2 x B x P``.
 
-    Searches begin with those ``before``, of fewer rows; else with the most likely of some draws
-    from the prior, and the medians of the priors; with parameters of a physics also the best ones;
-    precise ones of few rows also with draws from the posterior, of which a mode may be too narrow
-    for others to find.
+    Searches begin at ``before``, the ends of those by fewer rows; without these with likely draws
+    from the prior, its medians, and a fit of parameters by least squares. Those of a point fit by
+    up to 200 rows begin with all of these, and up to 40 rows with draws from the posterior, which
+    also find narrow modes.
     """
     density, like = partial(model.log_likelihood, choice=choice), model.u.detach()[0]
-    if before is not None:
+    n, shared = model.targets().shape[-1], len(model.table.shared)
+    is_thorough = n <= _SHARED and is_precise and not shared
+    if before is not None and not is_thorough:
         return _sorted(model, choice, maximise(density, before, is_precise))
-    shared = len(model.table.shared)
     number = max(16, 6400 // max(len(model.data.Y), 25))
     generator = torch.Generator().manual_seed(seed)
     u = standard_normal((number, *like.shape), generator, like)
     searches = _SEARCHES // 2 if choice else _SEARCHES
-    others = u[:0]
-    if is_precise and not shared and model.targets().shape[-1] <= _SMALL:
+    others = u[:0] if before is None else before
+    if is_thorough and n <= _SMALL:
         draws = sample(density, like, _BEFORE_SEARCH, seed, first=_FIRST_OF_SEARCH)
         others = _sorted(model, choice, draws.u)[: _SEARCHES // 2]
     likely = _sorted(model, choice, u)[: searches - 1 - len(others)]

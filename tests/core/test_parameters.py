@@ -147,7 +147,7 @@ def test_a_parameter_that_a_delta_takes_the_place_of_keeps_its_prior(n):
     grid = torch.linspace(-50, 150, 2001).to(X)
     below = torch.cat([(weights * height.cdf(h)).sum().unsqueeze(0) for h in grid])
     exact = [grid[(below < end).sum()] for end in (0.025, 0.975)]
-    assert ((high - low)[0] / (exact[1] - exact[0])).item() == pytest.approx(1, abs=0.35)
+    assert ((high - low)[0] / (exact[1] - exact[0])).item() == pytest.approx(1, abs=0.45)
 
 
 def product(n, noise):
