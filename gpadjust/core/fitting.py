@@ -392,7 +392,9 @@ def modes(
     generator = torch.Generator().manual_seed(seed)
     u = standard_normal((number, *like.shape), generator, like)
     searches = _SEARCHES // 2 if choice else _SEARCHES
-    others = u[:0] if before is None else before
+    others = before
+    if others is None:
+        others = u[:0]
     if is_thorough and n <= _SMALL:
         draws = sample(density, like, _BEFORE_SEARCH, seed, first=_FIRST_OF_SEARCH)
         others = _sorted(model, choice, draws.u)[: _SEARCHES // 2]
