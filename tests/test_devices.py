@@ -12,7 +12,7 @@ FACTORIES = {*FACTORIES.split(), "zeros"}
 # Functions that may make tensors on the CPU, by why.
 ALLOWED = {
     "numbers of rows or draws, which index tensors of any device": {
-        "core/fitting.py": "_parts _evenly modes",
+        "core/fitting.py": "_parts _evenly",
         "core/functions.py": "__init__",
         "core/model.py": "log_likelihood",
         "core/nuts.py": "proposed",

@@ -414,7 +414,7 @@ def _rivals(model: GP, choice: int, ends: Tensor) -> Tensor:
     rival, second = log_density.masked_fill(is_near, -math.inf).max(0)
     if not (rival > log_density[0] - _LESS_LIKELY).any():
         return ends[:1]
-    return torch.stack([ends[0], ends[second, torch.arange(len(second))]])
+    return torch.stack([ends[0], ends[second, torch.arange(len(second), device=second.device)]])
 
 
 def _with_least_squares(model: GP, choice: int, u: Tensor) -> Tensor:
