@@ -1,5 +1,6 @@
 """Parameters of a physics: narrow posteriors, ridges, several optima, and straight coordinates."""
 
+import math
 import warnings
 from functools import partial
 
@@ -113,6 +114,27 @@ def test_draws_go_beyond_a_fold():
     assert abs(draws.mean() - (weights * a).sum()) < 0.04
     square = draws.square().mean() / (weights * a.square()).sum()
     assert square.item() == pytest.approx(1, abs=0.25)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_draws_reach_a_long_tail(seed):
+    """Of a rate that may be as large as the prior allows: all data are saturated but for noise."""
+    X, noise = line(8, 1.0, 2.0), 0.3
+    physics = FormulaPhysics("1 - exp(-a * x)", ["x"], unknowns={"a": Unknown(1.0, factor=5.0)})
+    model = CalibratedPhysics(X, 0.95 + noise * normal(8, 1, seed=4), noise**2, physics=physics)
+    result = fit(model, seed=seed)
+    u = torch.linspace(-8, 8, 8001, dtype=torch.float64)
+    a = physics.unknowns.to_values(u.unsqueeze(-1))
+    misfit = (model.data.Y.mT - 1 + (-a * X.mT).exp()).square().sum(-1)
+    log = -0.5 * misfit / noise**2 - 0.5 * u.square()
+    weights = log.softmax(0)
+    size = log.logsumexp(0) + math.log(u[1] - u[0]) - 0.5 * math.log(2 * torch.pi)
+    evidence = size - 8 * math.log(noise * math.sqrt(2 * torch.pi))
+    assert result.log_evidence.item() == pytest.approx(evidence.item(), abs=0.08)
+    found = model.physics_parameters.coordinates[:, 0]
+    assert abs(found.mean() - (weights * u).sum()) < 0.1
+    for end in (0.5, 1.5, 2.5):
+        assert abs((found > end).double().mean() - weights[u > end].sum()) < 0.05
 
 
 @pytest.mark.parametrize("n", [10, 45])
