@@ -22,7 +22,7 @@ from paper.common.runner import (
     stale_list,
     write_tables,
 )
-from paper.common.runs import rounded
+from paper.common.runs import processor, rounded
 from paper.pages import QUOTING, report, results, wrong_quotes
 
 CLOSE = 1e-3  # of numbers that count as the same
@@ -44,9 +44,11 @@ def check(experiments: dict[str, str], known: bool = True) -> dict[str, str]:
             name = f"{experiment.name} {learner}"
             if not known and name in stale_list():
                 continue
-            older = _older(run, experiment)
+            older, hindrance = _older(run, experiment), _hindrance(run, experiment)
             if older:
                 stale[name] = older
+            elif hindrance:
+                print(f"{name}: {hindrance}, not made again")
             else:
                 jobs.append((_cost(run, experiment), name, experiment, case, run))
     jobs.sort(key=lambda job: job[:2])
@@ -91,6 +93,16 @@ def _older(run: Run, experiment: Experiment) -> str:
     if "took" not in run:
         return "it was made before runs were checked"
     return made_otherwise({**run, "versions": {}}, experiment)
+
+
+def _hindrance(run: Run, experiment: Experiment) -> str:
+    """Why a run cannot be made again here; empty if it can."""
+    try:
+        experiment.check()
+    except ImportError as error:
+        return str(error).splitlines()[0].rstrip(".")
+    is_other = experiment.chaotic and run.get("processor") != processor()
+    return "was made by another processor" if is_other else ""
 
 
 def _again(name: str, experiment: Experiment, case: Case, run: Run) -> tuple[str, str, float]:

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -14,11 +15,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import torch
 from filelock import FileLock
 
 from paper.common.experiment import Case, Run
 
-IDENTIFYING = ("settings", "defaults", "versions", "commit", "date")
+IDENTIFYING = ("settings", "defaults", "versions", "processor", "commit", "date")
 """Entries of a run that say how it was made."""
 
 
@@ -123,6 +125,17 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
         with suppress(PackageNotFoundError):
             numbers[name] = version(name)
     return numbers
+
+
+@cache
+def processor() -> str:
+    """What rounds the numbers: the processor's name and version, and the instructions in use."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    said = dict(re.split(r"\s*:\s*", line, maxsplit=1) for line in lines if ":" in line)
+    parts = [said.get(name) for name in ("model name", "cpu family", "model", "stepping")]
+    parts += [platform.machine(), torch.backends.cpu.get_cpu_capability()]
+    return " ".join(part for part in parts if part)
 
 
 def rounded(value: Any, digits: int) -> Any:

@@ -1,5 +1,6 @@
 """What keeps the numbers true: quotes are those of their tables, and runs can be made again."""
 
+from importlib import import_module
 from pkgutil import resolve_name
 
 import pytest
@@ -93,6 +94,19 @@ def test_runs_of_unrecorded_code_are_stale_without_being_made_again(squares):
     for run in runs:
         file.append(run)
     assert check.check(known) == dict.fromkeys(["toy a", "toy b"], "its commit is not recorded")
+
+
+def test_what_cannot_be_made_again_here_is_not_stale(squares, monkeypatch, capsys):
+    _, known = squares
+    monkeypatch.setattr(Toy, "run", lambda self, kind, seed: {"value": -1})
+    monkeypatch.setattr(Toy, "chaotic", True)
+    assert [*check.check(known)] == ["toy a", "toy b"]  # the processor is the same
+    monkeypatch.setattr(check, "processor", lambda: "another")
+    assert check.check(known) == {}
+    assert "toy a: was made by another processor, not made again" in capsys.readouterr().out
+    monkeypatch.setattr(Toy, "check", lambda self: import_module("not_there"))
+    assert check.check(known) == {}
+    assert "toy a: No module named 'not_there', not made again" in capsys.readouterr().out
 
 
 @pytest.mark.slow
