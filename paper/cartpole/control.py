@@ -112,9 +112,10 @@ class Recorder(BaseCallback):
 
     def record_fit(self, agent: DynaSAC, event: str, metrics: dict[str, float]) -> None:
         """Record the scores of the model on the episode, once it can predict."""
-        if self._record is not None and event == "fit" and "nlpd" in metrics:
-            errors = [value for name, value in metrics.items() if name.startswith("rmse/")]
-            self._record |= {name: metrics[name] for name in ("nlpd", "coverage")}
+        errors = [value for name, value in metrics.items() if name.startswith("rmse/")]
+        if self._record is not None and event == "fit" and errors:
+            # f_p alone has no variance, so that it has errors only.
+            self._record |= {name: metrics.get(name) for name in ("nlpd", "coverage")}
             self._record["rmse"] = errors
 
     def _on_rollout_start(self) -> None:

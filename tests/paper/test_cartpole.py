@@ -37,14 +37,14 @@ def test_what_identifies_a_run_holds_what_the_settings_do_not_say():
 class TestCartPole:
     @pytest.mark.slow
     def test_smoke(self, tmp_path, capsys):
-        experiment = CartPole(out=tmp_path, runs=2, jobs=1, only=("mf", "cka"), **TINY)
+        experiment = CartPole(out=tmp_path, runs=2, jobs=1, only=("mf", "phy", "cka"), **TINY)
         main(experiment)
         assert "Cost, sampled actions" in capsys.readouterr().out
         assert (tmp_path / "cartpole" / "figure2.png").exists()
         found = runs_file(experiment).read()
         episodes = {name: found[name, 1]["episodes"] for name in experiment.only}
         assert [value is None for value in episodes["cka"]["nlpd"]] == [True, False, True]
-        assert len(episodes["cka"]["rmse"][1]) == 4
+        assert len(episodes["cka"]["rmse"][1]) == len(episodes["phy"]["rmse"][1]) == 4
         assert all(0 < cost <= 1 for of in episodes.values() for cost in of["cost"])
 
     @pytest.mark.slow
