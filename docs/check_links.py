@@ -31,7 +31,7 @@ class Page(HTMLParser):
 
 
 def problems(site: Path) -> list[str]:
-    """What is wrong with the pages and styles of a site."""
+    """Return what is wrong with the pages and styles of a site."""
     pages = {path.resolve(): Page(path) for path in sorted(site.rglob("*.html"))}
     found, links = [], 0
     for path, page in pages.items():

@@ -10,12 +10,12 @@ from gpadjust import CKA, fit
 
 
 def laminar(X):
-    """Logarithm of the Nusselt number; X: logarithm to base 10 of Reynolds'."""
+    """Return the log of Nusselt's number; X: log10 of Reynolds'."""
     return torch.full_like(X, 3.66).log()
 
 
 def turbulent(X):
-    """The same by Dittus and Boelter, of water."""
+    """Return the same by Dittus and Boelter, of water."""
     return (0.023 * (10**X) ** 0.8 * 7**0.4).log()
 
 

@@ -17,7 +17,7 @@ DATA = files("gpadjust.records") / "pendulum"
 
 
 def frictionless(state, action, p):
-    """Rates of angle and angular velocity."""
+    """Return rates of angle and angular velocity."""
     angle, rate = state.unbind(-1)
     torque = action[:, 0] - 9.81 * p.moment * angle.sin()
     return torch.stack([rate, torque / p.inertia], dim=-1)

@@ -11,7 +11,7 @@ from gpadjust.kinds import HeavyTails
 
 
 def catalogue(X):
-    """Head in m at a flow in l/s, when the pump was new."""
+    """Return the head in m at a flow in l/s, when the pump was new."""
     return 32 - 0.18 * X**2
 
 

@@ -13,7 +13,7 @@ from gpadjust import CKA, fit
 
 
 def worth(X, first=60e3, second=75e3):
-    """Yield of B in A -> B -> C in %, less 0.4 a minute; energies in J/mol."""
+    """Return % of B in A -> B -> C, less 0.4 a minute; energies in J/mol."""
     inverse = (1 / X[:, 0] - 1 / 340) / 8.314  # X: temperature in K, time in min
     k1, k2 = 0.08 * (-first * inverse).exp(), 0.03 * (-second * inverse).exp()
     share = k1 / (k2 - k1) * ((-k1 * X[:, 1]).exp() - (-k2 * X[:, 1]).exp())
@@ -21,12 +21,12 @@ def worth(X, first=60e3, second=75e3):
 
 
 def truth(X):
-    """The worth by the real energies."""
+    """Return the worth by the real energies."""
     return worth(X, first=45e3, second=95e3)
 
 
 def measure(X):
-    """A batch in the plant, with noise of 0.5."""
+    """Run a batch in the plant, with noise of 0.5."""
     return truth(X) + 0.5 * torch.randn(len(X), 1, dtype=torch.float64)
 
 

@@ -83,7 +83,7 @@ def _all(arguments: list[str]) -> None:
 
 
 def _about(name: str) -> str:
-    """The first line of what its class says."""
+    """Return the first line of the docstring of a class."""
     return str(resolve_name(EXPERIMENTS[name]).__doc__).partition("\n")[0]
 
 

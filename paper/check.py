@@ -30,7 +30,7 @@ BUDGET = 330.0  # CPU seconds of all cases that are made again: three minutes of
 
 
 def check(experiments: dict[str, str], known: bool = True) -> dict[str, str]:
-    """The learners whose numbers today's code does not make again, with the first difference.
+    """Return the learners whose numbers today's code does not make again, with the reason.
 
     Args:
         experiments: Classes of the experiments, by name.
@@ -67,14 +67,14 @@ def check(experiments: dict[str, str], known: bool = True) -> dict[str, str]:
 
 
 def _cost(run: Run, experiment: Experiment) -> float:
-    """CPU seconds of a case that is made again, or of its beginning."""
+    """Return the CPU seconds of a case that is made again, or of its beginning."""
     shares = [value / experiment.settings[name] for name, value in experiment.cheap.items()]
     seconds: float = run["took"] * min([1.0, *shares])
     return seconds
 
 
 def cheapest(experiment: Experiment) -> Iterator[tuple[str, Case, Run]]:
-    """The recorded case of each learner that took least time."""
+    """Yield the recorded case of each learner that took least time."""
     done = runs_file(experiment).read()
     asked = {case[:-1] for case in experiment.cases()}
     of: dict[str, list[Case]] = {}
@@ -87,7 +87,7 @@ def cheapest(experiment: Experiment) -> Iterator[tuple[str, Case, Run]]:
 
 
 def _older(run: Run, experiment: Experiment) -> str:
-    """Why a run is of other code, if that can be told without making it again."""
+    """Return why a run is stale, if that is known without making it again."""
     if not run.get("commit"):
         return "its commit is not recorded"
     if "took" not in run:
@@ -96,7 +96,7 @@ def _older(run: Run, experiment: Experiment) -> str:
 
 
 def _hindrance(run: Run, experiment: Experiment) -> str:
-    """Why a run cannot be made again here; empty if it can."""
+    """Return why a run cannot be made again here; empty if it can."""
     try:
         experiment.check()
     except ImportError as error:
@@ -114,7 +114,7 @@ def _again(name: str, experiment: Experiment, case: Case, run: Run) -> tuple[str
 
 
 def difference(old: Any, new: Any, place: str = "") -> str:
-    """The first number that differs, with its place; empty if there is none.
+    """Return the first number that differs, with its place; empty if there is none.
 
     Times do not count, nor what a cheaper case has not: later elements of a list.
     """

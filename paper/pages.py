@@ -29,7 +29,7 @@ def report() -> None:
 
 
 def results(folder: Path) -> dict[str, str]:
-    """The tables of all experiments, by the names of their markers."""
+    """Return the tables of all experiments, by the names of their markers."""
     tables: dict[str, str] = {}
     for path in sorted(folder.glob("*/tables.md")):
         tables |= fragments(path.read_text())
@@ -37,7 +37,7 @@ def results(folder: Path) -> dict[str, str]:
 
 
 def wrong_quotes(text: str, tables: dict[str, str]) -> list[str]:
-    """The quotes of a text that differ from their tables, each with the reason."""
+    """Return the quotes of a text that differ from their tables, each with the reason."""
     by_anchor = {name.lower(): table for name, table in tables.items()}
     wrong = []
     for quoted, _, anchor, place in _LINK.findall(text):
@@ -48,7 +48,7 @@ def wrong_quotes(text: str, tables: dict[str, str]) -> list[str]:
 
 
 def _reason(quoted: str, table: str | None, place: str) -> str:
-    """What is wrong with a quote; empty if nothing is."""
+    """Return what is wrong with a quote; empty if nothing is."""
     numbers = _NUMBER.findall(quoted)
     if table is None:
         return "there is no such table"
@@ -68,7 +68,7 @@ def _reason(quoted: str, table: str | None, place: str) -> str:
 
 
 def _cells(table: str, column: str) -> list[tuple[str, str]]:
-    """The cells of a column, each for every label of its row."""
+    """Return the cells of a column, each for every label of its row."""
     lines = [line[2:-2].split(" | ") for line in table.splitlines() if line.startswith("| ")]
     header, rows = lines[0], lines[2:]
     if column not in header:

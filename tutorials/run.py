@@ -19,12 +19,12 @@ KEPT = {"kernelspec": {"display_name": "Python 3", "language": "python", "name":
 
 
 def notebooks() -> list[Path]:
-    """All tutorials, in their order."""
+    """Return all tutorials, in their order."""
     return sorted(FOLDER.glob("*.ipynb"))
 
 
 def quick_settings() -> dict[str, dict[str, str]]:
-    """What quick.toml replaces, by the notebook's file name."""
+    """Return what quick.toml replaces, by the notebook's file name."""
     with open(FOLDER / "quick.toml", "rb") as file:
         return tomllib.load(file)
 

@@ -48,13 +48,13 @@ def prepare(app: Sphinx, page: str, source: list[str]) -> None:
 
 
 def anchored(name: str, text: str) -> str:
-    """The tables of an experiment, each below an anchor by its marker."""
+    """Return the tables of an experiment, each below an anchor by its marker."""
     tables = re.sub(r"^<!-- (\S+:\S+) -->$", r"(\1)=\n", text, flags=re.MULTILINE)
     return f"---\norphan: true\n---\n\n# Tables of `paper {name}`\n\n{tables}"
 
 
 def gallery(text: str) -> str:
-    """The tutorials' README, its table as cards with pictures."""
+    """Return the tutorials' README, its table as cards with pictures."""
     rows = re.findall(r"^\| \[(\d+)\. (.+?)\]\((.+?)\.ipynb\) \| (.+?) \|$", text, re.MULTILINE)
     cards = [
         CARD.format(number=n, title=t, stem=s, text=text, picture=THUMBNAILS.get(n, 0))

@@ -32,7 +32,7 @@ def describe(
 
 
 def is_text(node: Node) -> bool:
-    """Whether a paragraph is running text, no cell of a table nor, in italics, a caption."""
+    """Return whether a paragraph is running text, no cell of a table nor, in italics, a caption."""
     running = isinstance(node.parent, section) and node.astext()
     return bool(running) and not isinstance(node.children[0], image | emphasis)
 

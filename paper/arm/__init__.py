@@ -61,7 +61,7 @@ class Arm(Control):
         load_opensim()
 
     def setup(self, name: str, seed: int) -> Setup:
-        """The arm; nothing in f_p is random."""
+        """Return the arm; nothing in f_p is random."""
         from paper.arm.evaluation import setup
 
         return setup(self.known[name], self.settings_of(name))

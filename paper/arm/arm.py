@@ -23,7 +23,7 @@ _SHOWN = (3, 6, 9, 12, 18, 24, 30)  # episodes
 
 
 def load_maps(runs: Sequence[Run], experiment: Control) -> pd.DataFrame:
-    """The errors in cm: a row for each learner, seed, mapped episode and target."""
+    """Return errors in cm: a row for each learner, seed, mapped episode and target."""
     frames = [
         pd.DataFrame(
             {
@@ -41,7 +41,7 @@ def load_maps(runs: Sequence[Run], experiment: Control) -> pd.DataFrame:
 
 
 def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     episodes, maps = load(runs, "episodes", experiment), load_maps(runs, experiment)
     evaluations = load(runs, "evaluations", experiment)
     of = {measure: Curves(evaluations, measure) for measure in MEASURES}
@@ -63,7 +63,7 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
 
 
 def _memory(every: Curves, experiment: Control) -> str:
-    """Errors with and without the previous action as an input, of the seeds that both have."""
+    """Return a table of errors with and without the previous action, of the seeds of both."""
     header, rows = ["", "runs"], []
     for first, last in WINDOWS:
         header += [f"{first}-{last} without", "with", "difference"]

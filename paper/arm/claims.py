@@ -47,7 +47,7 @@ LAST, MAP_AFTER = Arm.episodes, Arm.map_after
 
 
 def distance_from_start() -> np.ndarray:
-    """Distances of the targets from the hand at the start, in cm: ``121``."""
+    """Return the distances of the targets from the hand at the start, in cm: ``121``."""
     start = hand_position(arm_targets().new_tensor(START_MEAN))
     gap = hand_position(arm_targets()) - start
     return 100 * gap.square().sum(-1).sqrt().numpy()
@@ -103,7 +103,7 @@ def _cka(curves: Curves) -> Finding:
 
 
 def _less_spread(curves: Curves, name: str, other: str) -> Verdict:
-    """Verdict: runs of one learner differ less than those of another, by a bootstrap of seeds."""
+    """Judge whether a learner's runs differ less than another's, by a bootstrap of seeds."""
     values = [
         own[own["episode"] >= 3].pivot(index="seed", columns="episode", values=curves.measure)
         for own in (curves.of(name), curves.of(other))
@@ -114,7 +114,7 @@ def _less_spread(curves: Curves, name: str, other: str) -> Verdict:
 
 
 def _resampled(by_seed: pd.DataFrame) -> np.ndarray:
-    """Draws of the seeds with replacement, ``2000 x seeds x columns``, the same for all tables."""
+    """Resample the seeds, ``2000 x seeds x columns``, with the same draws for all tables."""
     n = len(by_seed)
     return by_seed.to_numpy()[np.random.default_rng(0).integers(n, size=(2000, n))]
 
@@ -135,7 +135,7 @@ def _rra(curves: Curves) -> Finding:
 
 
 def _by_target(maps: pd.DataFrame, curves: Curves, names: Sequence[str]) -> dict[str, pd.DataFrame]:
-    """The errors of some learners after trial 9: a row for each seed, a column for each target."""
+    """Return errors after trial 9, by learner: a row for each seed, a column for each target."""
     maps = maps[(maps["episode"] == MAP_AFTER) & maps["seed"].isin(curves.seeds("cka"))]
     return {
         name: maps[maps["learner"] == name].pivot(
@@ -182,7 +182,7 @@ def _gp_map(maps: pd.DataFrame, curves: Curves) -> Finding:
 
 
 def _best_of_all(name: str, others: Sequence[str], curves: Curves) -> Finding:
-    """Verdict: one learner ends better than others."""
+    """Judge whether one learner ends better than others."""
     gaps = {o: curves.paired_difference(o, 24, LAST, reference=name) for o in others}
     said = ", ".join(f"{SCENARIOS[o].label} {gap.text('.1f')}" for o, gap in gaps.items())
     verdict = all_of(*(within(gap, low=0) for gap in gaps.values()))
@@ -205,7 +205,7 @@ def _intervals(episodes: pd.DataFrame, curves: Curves) -> Finding:
 
 
 def claims(episodes: pd.DataFrame, maps: pd.DataFrame) -> tuple[Claim, ...]:
-    """The claims, by the records and the errors at each target."""
+    """Return the claims, by the records and the errors at each target."""
     best, second = (partial(_best_of_all, *names) for names in (
         ("cka", ("mf", "phy", "gp", "rra")), ("rra", ("mf", "phy", "gp")),
     ))  # fmt: skip

@@ -23,7 +23,7 @@ ACCURACY = 1e-5  # the environment's
 
 
 def setup(scenario: Scenario, settings: Arm) -> Setup:
-    """A run's arm, its task, and its recorder."""
+    """Return the arm, the task and the recorder of a run."""
     system = arm(
         strength=settings.strength,
         memory=settings.memory,
@@ -36,7 +36,7 @@ def setup(scenario: Scenario, settings: Arm) -> Setup:
 
 
 def reach(policy: Any, settings: Arm) -> NDArray[np.float64]:
-    """The distance of the hand, ``121 x episode_length`` in cm, by the deterministic policy.
+    """Return the distance of the hand, ``121 x episode_length`` in cm, by the deterministic policy.
 
     The real arm starts at rest at 35° and 65° for each target. All go a step at a time, so that the
     policy is asked once a step. No random number is drawn. An arm whose integration fails stays
@@ -73,7 +73,7 @@ def _simulation(strength: float) -> ArmSimulation:
 
 
 def score(distances: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """Root mean squares of distances ``121 x steps``, for each target: over all and the last."""
+    """Return root mean squares of ``121 x steps`` distances, by target: over all and the last."""
     squares = np.square(distances)
     return {
         "all_steps": np.sqrt(squares.mean(1)),
@@ -94,13 +94,13 @@ class ArmRecorder(Recorder):
         self.maps: dict[str, Any] = {}
 
     def of_policy(self, episode: int) -> dict[str, Any]:
-        """Nothing: evaluations have lists of their own, as there are fewer than episodes."""
+        """Return nothing: evaluations have lists of their own, as there are fewer than episodes."""
         if episode % self.settings.evaluate_every == 0:
             self.evaluate(episode)
         return {}
 
     def found(self) -> dict[str, Any]:
-        """The evaluations, the errors at each target after an episode, and the records."""
+        """Return evaluations, the errors at each target after an episode, and the records."""
         return {"evaluations": self.evaluations, "maps": self.maps, **super().found()}
 
     def evaluate(self, episode: int) -> None:

@@ -28,7 +28,7 @@ class Scenario(Learner):
 
 
 def scenario(name: str, label: str = "", max_runs: int | None = None, **changes: Any) -> Scenario:
-    """A scenario of a learner of the registry."""
+    """Return a scenario of a learner of the registry."""
     known = LEARNERS[name]
     kind = {"phy": "physics", "oracle": "truth", "mf": "none"}.get(name, "learnt")
     literal = LITERAL if name in ("cka", "rra") else {}
@@ -86,11 +86,11 @@ class Control(Experiment):
     """the states that models predict, and what they are called in tables, with units"""
 
     def setup(self, name: str, seed: int) -> Setup:
-        """The real system, what is known of it, and who writes down what happens, for a run."""
+        """Return the real system, its task and the recorder of a run."""
         raise NotImplementedError
 
     def updates_after(self, episode: int, model_free: bool) -> int:
-        """Gradient steps after a real episode (from 1), without those within the model."""
+        """Return the gradient steps after a real episode (from 1), outside the model."""
         if model_free and self.updates is not None:
             return self.updates
         if episode > self.last_model_episode:
@@ -98,7 +98,7 @@ class Control(Experiment):
         return self.episode_length + (self.updates_in_model() if model_free else 0)
 
     def updates_in_model(self) -> int:
-        """Gradient steps within the model after a real episode."""
+        """Return the gradient steps within the model after a real episode."""
         return round(self.updates_per_model_step * self.model_episodes * self.episode_length)
 
     @property
@@ -107,15 +107,15 @@ class Control(Experiment):
         return {name: scenario.label for name, scenario in self.known.items()}
 
     def settings_of(self, name: str) -> Any:
-        """The experiment with the settings of a learner."""
+        """Return the experiment with the settings of a learner."""
         return self.changed(self.known[name].changes)
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """Some learners have few seeds."""
+        """Return the seeds, of some learners few."""
         return self.seeds[: self.known[kind[0]].max_runs]
 
     def describe(self, *kind: Any) -> dict[str, Any]:
-        """The settings of the learner, and the task with its dynamics, if it has a model."""
+        """Return the settings of the learner, and the task with its dynamics, if it has a model."""
         name, settings = kind[0], self.settings_of(kind[0]).settings
         if self.known[name].kind == "none":
             return settings
@@ -163,7 +163,7 @@ class CartPole(Control):
     }
 
     def setup(self, name: str, seed: int) -> Setup:
-        """The cart-pole; all learners of a seed have the same f_p."""
+        """Return the cart-pole; all learners of a seed have the same f_p."""
         from paper.cartpole.system import setup
 
         return setup(self.known[name], self.settings_of(name), seed)

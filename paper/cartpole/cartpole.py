@@ -17,7 +17,7 @@ MEASURES = {"cost": "sampled", "evaluation": "deterministic"}
 
 
 def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
-    """All tables, by name; claims are judged of runs as long as the paper's."""
+    """Return all tables, by name; claims are judged if runs are as long as the paper's."""
     episodes = load(runs, "episodes", experiment)
     last, found = experiment.episodes, {}
     if last >= LAST:

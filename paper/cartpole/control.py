@@ -35,7 +35,7 @@ class Setup(NamedTuple):
 def dynamics(
     scenario: Scenario, settings: Control, spec: StateSpec, physics: Physics, truth: Physics
 ) -> Dynamics:
-    """The model of a learner; a model-free one does not use it."""
+    """Return the model of a learner; a model-free one does not use it."""
     if scenario.kind != "learnt":
         return PhysicsDynamics(spec, truth if scenario.kind == "truth" else physics)
     options = {"num_features": settings.num_features} if "RRA" in str(scenario.model) else {}
@@ -94,15 +94,15 @@ class Recorder(BaseCallback):
         self._steps = 0  # of the earlier episodes
 
     def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
-        """Entries of the record by an episode's transitions."""
+        """Return entries of the record by an episode's transitions."""
         return {}
 
     def of_policy(self, episode: int) -> dict[str, Any]:
-        """Entries by the policy after the updates that follow an episode (from 1)."""
+        """Return entries by the policy after the updates that follow an episode (from 1)."""
         return {}
 
     def found(self) -> dict[str, Any]:
-        """The records of a run, a list for each column but those without any number."""
+        """Return the records of a run, a list for each column that has a number."""
         columns = {name: [r[name] for r in self.records] for name in self.records[0]}
         shown = {n: column for n, column in columns.items() if any(v is not None for v in column)}
         return {"episodes": shown}
@@ -140,7 +140,7 @@ class Recorder(BaseCallback):
 
 
 def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
-    """A row for each learner, seed and element of an entry that has lists by name.
+    """Return a row for each learner, seed and element of an entry that has lists by name.
 
     Of ``"episodes"`` there is a column for the error of each state; episodes count from 1.
     """
@@ -161,7 +161,7 @@ def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
 
 
 def foresight(episodes: pd.DataFrame, experiment: Control) -> str:
-    """Scores of the models on episodes before they had them, from the second on."""
+    """Return scores of the models on episodes before they had them, from the second on."""
     scored = episodes[(episodes["episode"] > 1)]
     first = f"rmse_{next(iter(experiment.rmses))}"
     with_models = {*episodes[episodes[first].notna()]["learner"]}
@@ -178,7 +178,7 @@ def trials_table(
     own: pd.DataFrame, measure: str, labels: Mapping[Any, str], shown: Sequence[int],
     late: tuple[int, int], compared: tuple[int, int], form: str,
 ) -> str:  # fmt: skip
-    """Means of some trials, the worst of later ones, differences from CKA by the same seeds."""
+    """Return costs at some trials, the worst of later ones, and paired differences from CKA."""
     curves = Curves(own, measure)
 
     def gap(part: pd.DataFrame) -> str:

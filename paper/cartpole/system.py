@@ -25,7 +25,7 @@ from paper.cartpole.control import Recorder, Setup, dynamics
 
 
 def setup(scenario: Scenario, settings: CartPole, seed: int) -> Setup:
-    """A run's cart-pole, its task, and its recorder."""
+    """Return the cart-pole, the task and the recorder of a run."""
     length, encode = settings.episode_length, settings.encode_angle
     system = cart_pole(seed, encode_angle=encode, episode_length=length)
     physics: Any = system.physics
@@ -35,19 +35,19 @@ def setup(scenario: Scenario, settings: CartPole, seed: int) -> Setup:
 
 
 def true_physics() -> ODEPhysics:
-    """The system as it is."""
+    """Return the true system."""
     return equation_physics(REAL_CART_POLE)
 
 
 def fixed_starts(n: int) -> Tensor:
-    """The first ``n`` start states of the evaluation, from a generator of their own."""
+    """Return the first ``n`` start states of the evaluation, from a generator of their own."""
     generator = torch.Generator().manual_seed(1)
     noise = torch.randn(NUM_STARTS, 4, generator=generator, dtype=torch.float64)
     return (torch.tensor(START_MEAN, dtype=torch.float64) + START_STD * noise)[:n]
 
 
 def evaluate(agent: DynaSAC, settings: CartPole) -> float:
-    """The mean cost of the deterministic policy over the fixed starts; draws no random number."""
+    """Return the mean cost of the deterministic policy over the fixed starts, without chance."""
     system = cart_pole(encode_angle=settings.encode_angle, episode_length=settings.episode_length)
     task = replace(
         system.task(PhysicsDynamics(system.spec, true_physics())), initial_states=fixed_starts
@@ -67,9 +67,9 @@ class CartPoleRecorder(Recorder):
     """Records the cost of each episode, and that of the deterministic policy after it."""
 
     def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
-        """The mean cost of the sampled actions."""
+        """Return the mean cost of the sampled actions."""
         return {"cost": -cart_pole_reward(states, actions, next_states).mean().item()}
 
     def of_policy(self, episode: int) -> dict[str, Any]:
-        """The mean cost of the deterministic policy."""
+        """Return the mean cost of the deterministic policy."""
         return {"evaluation": evaluate(self.model, self.settings)}

@@ -94,14 +94,14 @@ class Experiment:
         return range(self.seed, self.seed + self.runs)
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """The seeds of a kind of cases (values of all axes); none if it is not to be run."""
+        """Return the seeds of a kind of cases (values of all axes), possibly none."""
         return self.seeds[:1] if kind[-1] in self.single else self.seeds
 
     def check(self) -> None:
         """Raise a ValueError for an option, or an ImportError for a package, that will not do."""
 
     def cases(self) -> list[Case]:
-        """What is asked for, in the order in which it is run.
+        """Return the cases, in the order in which they are run.
 
         Seed by seed with all values of the last axis, so that what is done first can be compared.
 
@@ -130,15 +130,15 @@ class Experiment:
         return {e.name: getattr(self, e.name) for e in fields(self) if e.name not in common}
 
     def changed(self: _Self, changes: Mapping[str, Any]) -> _Self:
-        """The experiment with other settings."""
+        """Return the experiment with other settings."""
         return replace(self, **changes)
 
     def describe(self, *kind: Any) -> dict[str, Any]:
-        """The settings that decide the numbers of a kind of cases; all of them, by default."""
+        """Return the settings that decide the numbers of a kind of cases; by default, all."""
         return self.settings
 
     def defaults(self) -> dict[str, dict[str, Any]]:
-        """The arguments of ``calls`` that have a default, as JSON has them; others by names."""
+        """Return the defaults of the arguments of ``calls``, as JSON has them; others by names."""
         found = {}
         for name in self.calls:
             parameters = inspect.signature(resolve_name(name)).parameters.values()
@@ -155,7 +155,7 @@ class Experiment:
         return results
 
     def tables(self, runs: Sequence[Run]) -> dict[str, Table]:
-        """The tables of all runs, by name."""
+        """Return the tables of all runs, by name."""
         tables: dict[str, Table] = self._call("tables", runs, self)
         return tables
 
@@ -164,7 +164,7 @@ class Experiment:
         return self._call("draw", runs, self) or []
 
     def _call(self, function: str, *arguments: Any) -> Any:
-        """What a function of the experiment's module returns; None if there is no such function."""
+        """Call a function of the experiment's module; return None if there is no such function."""
         module = import_module(f"{type(self).__module__}.{self.name}")
         return getattr(module, function, lambda *_: None)(*arguments)
 

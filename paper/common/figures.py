@@ -32,7 +32,7 @@ def panels(
     share: bool = True,
     width: float = 0.0,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with a panel for each title.
+    """Return a figure with a panel for each title.
 
     Args:
         titles: What stands above the panels.
@@ -56,7 +56,7 @@ def panels(
 
 
 def one_legend(figure: Figure, axes: Iterable[Axes], ncols: int = 3) -> None:
-    """A legend above a figure, of the lines in any of its panels, of which not all have all."""
+    """Add a legend above a figure, of the lines in any of its panels."""
     handles = {
         label: handle
         for ax in axes

@@ -17,7 +17,7 @@ def law_of(
     unknowns: Mapping[str, Unknown],
     values: Sequence[float] | None = None,
 ) -> FunctionPhysics:
-    """A law of inputs and parameters, with unknown parameters or these."""
+    """Return a law of inputs and parameters, unknown or given."""
     if values is None:
         return FunctionPhysics(following, unknowns=unknowns)
     known = ParameterValues(tuple(unknowns), torch.tensor(values, dtype=torch.float64))
@@ -25,7 +25,7 @@ def law_of(
 
 
 def path_of(spec: StateSpec, physics: Physics, start: Tensor, actions: Tensor) -> Tensor:
-    """The states ``n x state_dim`` by f_p alone from a start ``1 x state_dim``, without noise."""
+    """Return states ``n x state_dim`` by f_p alone from ``1 x state_dim``, without noise."""
     step, path = PhysicsDynamics(spec, physics).mean_function(), [start]
     for action in actions:
         path.append(step(path[-1][None], action.view(1, 1, 1))[0])
@@ -33,6 +33,6 @@ def path_of(spec: StateSpec, physics: Physics, start: Tensor, actions: Tensor) -
 
 
 def ends_of(free: FreeRun, column: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and ends of intervals of a state along the first free run."""
+    """Return mean and ends of intervals of a state along the first free run."""
     mean, low, high = (each[0, :, column] for each in (free.mean, free.lower, free.upper))
     return mean, low, high

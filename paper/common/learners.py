@@ -67,5 +67,5 @@ which is meant."""
 
 
 def labels(*names: str, **more: str) -> dict[str, str]:
-    """The values of an axis of learners: names of ``LEARNERS`` with their labels, then others."""
+    """Return the values of an axis: names of ``LEARNERS`` with their labels, then others."""
     return {name: LEARNERS[name].label for name in names} | more

@@ -32,7 +32,7 @@ STALE = PAPER / "stale.txt"
 
 
 def runs_file(experiment: Experiment) -> RunsFile:
-    """Where the runs of an experiment are."""
+    """Return the file of the runs of an experiment."""
     return RunsFile(experiment.folder / RUNS, experiment.key)
 
 
@@ -74,7 +74,7 @@ def write_tables(experiment: Experiment, runs: Sequence[Run]) -> dict[str, Table
 
 
 def tables_of(experiment: Experiment, runs: Sequence[Run]) -> dict[str, Table]:
-    """Settings and results, by the names of their markers in the pages, each with its stamp."""
+    """Return settings and results, by the names of their markers, each with its stamp."""
     tables = experiment.tables(runs)
     if experiment.settings:
         rows = [[f"`{name}`", f"{value}"] for name, value in experiment.settings.items()]
@@ -87,7 +87,7 @@ def tables_of(experiment: Experiment, runs: Sequence[Run]) -> dict[str, Table]:
 
 
 def stamp(experiment: Experiment, runs: Sequence[Run]) -> str:
-    """The commits that made the runs, with dates, and which of them are stale."""
+    """Return the commits that made the runs, with dates, and which learners are stale."""
     made = Counter((run.get("date") or "", (run.get("commit") or "")[:8]) for run in runs)
     parts = [
         f"{number} by {commit} of {date}" if commit else f"{number} by unrecorded code"
@@ -107,7 +107,7 @@ def stamp(experiment: Experiment, runs: Sequence[Run]) -> str:
 
 
 def stale_list() -> set[str]:
-    """Lines of ``STALE``."""
+    """Return the lines of ``STALE``."""
     return {*STALE.read_text().splitlines()} if STALE.exists() else set()
 
 
@@ -172,7 +172,7 @@ def check_settings(path: Path, done: Mapping[Case, Run], experiment: Experiment)
 
 
 def made_otherwise(run: Run, experiment: Experiment) -> str:
-    """The first package or default in which a run differs; empty if there is none."""
+    """Return the first package or default in which a run differs; empty if there is none."""
     if experiment.calls and not run.get("defaults"):
         return "the defaults of the library are not recorded with them"
     now = {"versions": versions(experiment.packages), "defaults": experiment.defaults()}
@@ -181,6 +181,6 @@ def made_otherwise(run: Run, experiment: Experiment) -> str:
 
 @cache
 def _described(experiment: Experiment, kind: Case) -> dict[str, Any]:
-    """The settings of a kind of cases, as JSON has them."""
+    """Return the settings of a kind of cases, as JSON has them."""
     described: dict[str, Any] = json.loads(json.dumps(experiment.describe(*kind)))
     return described

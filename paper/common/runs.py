@@ -71,7 +71,7 @@ class RunsFile:
                 ) from error
 
     def read(self) -> dict[Case, Run]:
-        """All runs, by case; nothing is changed.
+        """Return all runs, by case; nothing is changed.
 
         Raises:
             ValueError: If a line that is whole is none of a run.
@@ -95,7 +95,7 @@ class RunsFile:
         return runs
 
     def _whole(self) -> bytes:
-        """The file without a torn last line."""
+        """Return the file without a torn last line."""
         content = self.path.read_bytes() if self.path.exists() else b""
         return content[: content.rfind(b"\n") + 1]
 
@@ -105,7 +105,7 @@ def _line(entries: Run) -> bytes:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """The first entry that both have and that differs, in words; empty if there is none."""
+    """Return the first entry that both have and that differs, in words; empty if there is none."""
     for name in (name for name in old if name in new):
         was, now = old[name], new[name]
         if isinstance(was, dict) and isinstance(now, dict):
@@ -119,7 +119,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
 
 @cache
 def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Of Python and of what the numbers come from."""
+    """Return the versions of Python and of packages."""
     numbers = {"python": platform.python_version()}
     for name in packages:
         with suppress(PackageNotFoundError):
@@ -129,7 +129,7 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
 
 @cache
 def processor() -> str:
-    """What rounds the numbers: the processor's name and version, and the instructions in use."""
+    """Return the processor's name and version, and the instructions in use."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     said = dict(re.split(r"\s*:\s*", line, maxsplit=1) for line in lines if ":" in line)
@@ -139,7 +139,7 @@ def processor() -> str:
 
 
 def rounded(value: Any, digits: int) -> Any:
-    """Significant digits of numbers, also in lists and dictionaries; None for nan."""
+    """Round numbers to significant digits, also in lists and dictionaries; nan becomes None."""
     if isinstance(value, float):
         return None if math.isnan(value) else float(f"{value:.{digits}g}")
     if isinstance(value, list | tuple):
@@ -151,7 +151,7 @@ def rounded(value: Any, digits: int) -> Any:
 
 @cache
 def commit_of(root: Path) -> tuple[str, str] | None:
-    """The hash of a repository's current commit and its date, read once per process.
+    """Return the hash of a repository's current commit and its date, read once per process.
 
     A ``"+"`` follows the hash if tracked files differ from it. Those in ``paper/results`` do not
     count, which runs themselves change.
@@ -171,7 +171,7 @@ def commit_of(root: Path) -> tuple[str, str] | None:
 
 
 def _git(root: Path, *command: str) -> str | None:
-    """The output of a git command; None if it fails or git is not installed."""
+    """Return the output of a git command; None if it fails or git is not installed."""
     try:
         done = subprocess.run(
             ["git", "-C", str(root), *command], capture_output=True, text=True, check=True

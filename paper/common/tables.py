@@ -24,7 +24,7 @@ _FRAGMENT = re.compile(_START + r"((?:(?!<!-- ).*\n)*?)" + _END)
 def frame(
     runs: Sequence[Run], lists: str | Sequence[str] = (), index: str = "episode"
 ) -> pd.DataFrame:
-    """Runs as a table, without what identifies them.
+    """Return runs as a table, without what identifies them.
 
     Args:
         runs: The runs.
@@ -52,7 +52,7 @@ def groups(
     by: str | Sequence[str],
     labels: Mapping[Any, str] | Callable[..., str] | None = None,
 ) -> dict[str, pd.DataFrame]:
-    """The rows of a table: parts of the runs, by their labels.
+    """Return the rows of a table: parts of the runs, by their labels.
 
     Args:
         runs: All runs.
@@ -77,7 +77,7 @@ def of(
     form: str = ".3g",
     **only: Any,
 ) -> Cell:
-    """A cell with a statistic of a column; empty where there is none.
+    """Return a cell with a statistic of a column; empty where there is none.
 
     Args:
         value: The column.
@@ -99,7 +99,7 @@ def of(
 
 
 def part_of(runs: pd.DataFrame, **only: Any) -> pd.DataFrame:
-    """The runs that have these values in these columns."""
+    """Return the runs that have these values in these columns."""
     for column, value in only.items():
         runs = runs[runs[column] == value]
     return runs
@@ -108,7 +108,7 @@ def part_of(runs: pd.DataFrame, **only: Any) -> pd.DataFrame:
 def mean_error(
     value: str, form: str, error: str | None = None, *, counted: bool = False, **only: Any
 ) -> Cell:
-    """A cell with the mean, its standard error if runs differ, and of how many it is."""
+    """Return a cell with the mean, its standard error if runs differ, and the number of runs."""
 
     def cell(runs: pd.DataFrame) -> str:
         found = Difference.of(pd.to_numeric(part_of(runs, **only)[value]))
@@ -121,12 +121,12 @@ def mean_error(
 
 
 def ratio_of(value: str, name: str, other: str) -> Cell:
-    """A cell with the geometric mean of ratios of two learners and its 95 % interval, by seeds."""
+    """Return a cell with the geometric mean of two learners' ratios and its 95 % interval."""
     return lambda runs: paired(runs, value, "learner", name, other, ratio=True).ratio()
 
 
 def across(runs: pd.DataFrame, by: str, labels: Mapping[Any, str], cell: Cell) -> dict[str, Cell]:
-    """Columns for the values of a column that the runs have, in the order of their labels."""
+    """Return columns for the values of a column that the runs have, in the order of labels."""
 
     def restricted(value: Any) -> Cell:
         return lambda part: cell(part[part[by] == value])
@@ -141,7 +141,7 @@ def table(
     corner: str = "",
     more: Iterable[Sequence[str]] = (),
 ) -> str:
-    """A table of runs.
+    """Return a table of runs.
 
     Args:
         rows: The runs of each row, by its label, as ``groups`` makes them.
@@ -155,13 +155,13 @@ def table(
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of texts."""
+    """Return a table of texts."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def as_document(tables: Mapping[str, Table]) -> str:
-    """Tables as a file, each between the markers that it has in the pages."""
+    """Return tables as a file, each between the markers that it has in the pages."""
     parts = [
         f"{table.title}\n\n<!-- {name} -->\n{table.text}\n<!-- end -->"
         for name, table in tables.items()
@@ -170,7 +170,7 @@ def as_document(tables: Mapping[str, Table]) -> str:
 
 
 def fragments(text: str) -> dict[str, str]:
-    """What stands between the markers of a text, by their names."""
+    """Return the texts between the markers of a text, by their names."""
     _check_markers(text)
     return {name: content.rstrip("\n") for name, content in _FRAGMENT.findall(text)}
 
@@ -203,12 +203,12 @@ def _check_markers(text: str) -> None:
 
 
 def number(value: Any, form: str = ".3g") -> str:
-    """A number in a cell, which is empty if there is none."""
+    """Return a number in a cell, which is empty if there is none."""
     return "" if pd.isna(value) else format(value, form)
 
 
 def claims_table(parts: Mapping[str, Sequence[Judged]]) -> str:
-    """Verdicts on the same claims, side by side: of each column, by its heading."""
+    """Return verdicts on the same claims side by side, a column for each heading."""
     rows = []
     for judged in zip(*parts.values(), strict=True):
         found = [f"**{claim.verdict}**: {claim.measured}" for claim in judged]

@@ -31,7 +31,7 @@ class Difference:
 
     @classmethod
     def of(cls, values: ArrayLike) -> Difference:
-        """Of some differences; nan are left out."""
+        """Return the mean of differences with its error; nan are left out."""
         found = np.asarray(values, dtype=float)
         found = found[~np.isnan(found)]
         mean = float(found.mean()) if len(found) else np.nan
@@ -57,13 +57,13 @@ class Difference:
         return self.mean + self.half_width
 
     def text(self, form: str = ".3f") -> str:
-        """In words, with the standard error unless it is nan, as it is of a single run."""
+        """Return the difference in words, without its standard error if that is nan."""
         if np.isnan(self.mean):
             return ""
         return f"{self.mean:+{form}}" + ("" if np.isnan(self.error) else f" ± {self.error:{form}}")
 
     def ratio(self, form: str = ".2f") -> str:
-        """Of differences of logarithms: the geometric mean of ratios, and its 95 % interval."""
+        """Return the geometric mean of ratios and its 95 % interval, of logarithms."""
         if np.isnan(self.mean):
             return ""
         middle, low, high = np.exp([self.mean, self.low, self.high])
@@ -80,7 +80,7 @@ def paired(
     *,
     ratio: bool = False,
 ) -> Difference:
-    """How much more a value is for one entry of the column ``by`` than for another, pair by pair.
+    """Return how much more a value is for one entry of the column ``by`` than for another.
 
     Runs of a pair share the columns ``on``; of ratios logarithms are compared. It is nan if there
     is no pair.
@@ -93,7 +93,7 @@ def paired(
 
 
 def scores_of(mean: Tensor, low: Tensor, high: Tensor, measured: Tensor) -> dict[str, Any]:
-    """Error, coverage and half width of intervals of a path of ``n``."""
+    """Return error, coverage and half width of intervals of a path of ``n``."""
     inside = (low <= measured) & (measured <= high)
     return {
         "rmse": float((mean - measured).square().mean().sqrt()),
@@ -116,45 +116,45 @@ class Curves:
         return list(self.runs["learner"].unique())
 
     def of(self, name: str) -> pd.DataFrame:
-        """The rows of a learner."""
+        """Return the rows of a learner."""
         return self.runs[self.runs["learner"] == name]
 
     def seeds(self, name: str, last: int = 0) -> set[int]:
-        """The seeds of a learner; with a last episode, of the runs that reached it."""
+        """Return the seeds of a learner; with a last episode, of the runs that reached it."""
         own = self.of(name)
         return set(own[own["episode"] >= last]["seed"])
 
     def restricted(self, seeds: set[int]) -> Curves:
-        """Those of some seeds only."""
+        """Return the curves of some seeds."""
         return replace(self, runs=self.runs[self.runs["seed"].isin(seeds)])
 
     def mean(self, name: str) -> pd.Series[float]:
-        """The mean over the runs, by episode."""
+        """Return the mean over the runs, by episode."""
         return self.of(name).groupby("episode")[self.measure].mean()
 
     def spread(self, name: str) -> pd.Series[float]:
-        """The standard deviation over the runs, by episode."""
+        """Return the standard deviation over the runs, by episode."""
         return self.of(name).groupby("episode")[self.measure].std()
 
     def mean_at(self, name: str, episode: int) -> float:
-        """The mean over the runs at an episode; nan if none got there."""
+        """Return the mean over the runs at an episode; nan if none got there."""
         return float(self.mean(name).get(episode, np.nan))
 
     def first_below(self, name: str, threshold: float) -> int | None:
-        """The first episode at which the mean over the runs is not above a threshold."""
+        """Return the first episode at which the mean over the runs is not above a threshold."""
         mean = self.mean(name)
         below = mean.index[mean <= threshold]
         return int(below[0]) if len(below) else None
 
     def window(self, name: str, first: int, last: int) -> pd.Series[float]:
-        """The mean over some episodes, by seed."""
+        """Return the mean over some episodes, by seed."""
         own = self.of(name)
         return own[own["episode"].between(first, last)].groupby("seed")[self.measure].mean()
 
     def paired_difference(
         self, name: str, first: int, last: int, reference: str = "cka"
     ) -> Difference:
-        """How much more a learner has than another with the same seeds, over some episodes.
+        """Return how much more a learner has than another with the same seeds, over some episodes.
 
         It is nan for the reference itself, and where no seed is shared.
         """
@@ -163,7 +163,7 @@ class Curves:
         return Difference.of(self.window(name, first, last) - self.window(reference, first, last))
 
     def described(self, name: str, levels: Sequence[float], unit: str = "") -> str:
-        """When the mean first was at some levels, in words."""
+        """Return when the mean first was at some levels, in words."""
         return ", ".join(f"{x}{unit} {reached(self.first_below(name, x))}" for x in levels)
 
 
@@ -188,7 +188,7 @@ class Claim(NamedTuple):
 
 
 def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
-    """All claims, each by the seeds with which all its learners reached the last episode.
+    """Judge all claims, each by the seeds with which all its learners reached the last episode.
 
     One of fewer than two such seeds is not judged.
     """
@@ -208,14 +208,14 @@ def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
 
 
 def reproduced(held: bool, beaten: bool = False) -> Verdict:
-    """The verdict on a claim of the paper."""
+    """Return the verdict on a claim of the paper."""
     if not held:
         return "not reproduced"
     return "beaten" if beaten else "reproduced"
 
 
 def between(ends: Sequence[float], low: float = -np.inf, high: float = np.inf) -> Verdict:
-    """Whether an interval lies between two bounds; inconclusive if a bound lies in it."""
+    """Judge whether an interval lies between two bounds; inconclusive if a bound lies in it."""
     least, most = ends
     if low <= least and most <= high:
         return "reproduced"
@@ -223,7 +223,7 @@ def between(ends: Sequence[float], low: float = -np.inf, high: float = np.inf) -
 
 
 def within(difference: Difference, low: float = -np.inf, high: float = np.inf) -> Verdict:
-    """Whether a difference is between two bounds, by its 95 % interval.
+    """Judge whether a difference is between two bounds, by its 95 % interval.
 
     Of one run, or of runs that are all alike, what it is decides.
     """
@@ -232,15 +232,15 @@ def within(difference: Difference, low: float = -np.inf, high: float = np.inf) -
 
 
 def all_of(*verdicts: Verdict) -> Verdict:
-    """The verdict on a claim of several parts: the worst of theirs."""
+    """Return the verdict on a claim of several parts: the worst of theirs."""
     return min(verdicts, key=_FROM_WORST.index)
 
 
 def counted(runs: int) -> str:
-    """A number of runs, in words."""
+    """Return a number of runs, in words."""
     return f"{runs} run{'' if runs == 1 else 's'}"
 
 
 def reached(episode: int | None) -> str:
-    """When a threshold was reached, in words."""
+    """Return when a threshold was reached, in words."""
     return "never" if episode is None else f"at trial {episode}"

@@ -55,7 +55,7 @@ class Known(Experiment):
     cheap: ClassVar[Mapping[str, Any]] = {"trials": 1}
 
     def describe(self, *kind: Any) -> dict[str, Any]:
-        """The settings, and how far plans look."""
+        """Return the settings, and how far plans look."""
         return {**self.settings, "horizon": HORIZONS[kind[0]]}
 
 

@@ -20,12 +20,12 @@ Parameters = Mapping[str, Any]
 
 
 def friction(rate: Tensor, p: Parameters) -> Tensor:
-    """Viscous and dry friction of a joint, a torque against its rate."""
+    """Return the viscous and dry friction of a joint, a torque against its rate."""
     return p["viscous"] * rate + p["dry"] * (rate / _SLIDES).tanh()
 
 
 def pendulum(state: Tensor, action: Tensor, p: Parameters) -> Tensor:
-    """A rod on a drive, Pendulum-v1's: its angle is from upright, and gravity is 10 m/s²."""
+    """Return the rates of Pendulum-v1's rod on a drive; its angle is from upright, g 10 m/s²."""
     theta, rate = state.unbind(-1)
     torque = action[:, 0] - friction(rate, p)
     inertia = p["mass"] * p["length"] ** 2 / 3
@@ -33,7 +33,7 @@ def pendulum(state: Tensor, action: Tensor, p: Parameters) -> Tensor:
 
 
 def furuta(state: Tensor, action: Tensor, p: Parameters) -> Tensor:
-    """A pendulum on an arm that a voltage turns in the plane; theta is from upright.
+    """Return the rates of a pendulum on an arm that a voltage turns; theta is from upright.
 
     Lagrange's equations of two uniform rods. The motor's torque falls with its speed by the
     voltage that it induces; arm and joint have friction.
@@ -56,7 +56,7 @@ def furuta(state: Tensor, action: Tensor, p: Parameters) -> Tensor:
 
 
 def quadrotor(state: Tensor, action: Tensor, p: Parameters) -> Tensor:
-    """A rigid body in a vertical plane under two thrusts, left and right; drag by the speed."""
+    """Return the rates of a rigid body in a vertical plane under two thrusts, and drag."""
     _, _, phi, x_rate, z_rate, turn = state.unbind(-1)
     left, right = action.unbind(-1)
     thrust = left + right
@@ -69,7 +69,7 @@ def quadrotor(state: Tensor, action: Tensor, p: Parameters) -> Tensor:
 
 
 def tanks(state: Tensor, action: Tensor, p: Parameters) -> Tensor:
-    """Levels of two tanks in cm, the upper one filled by a pump and empty into the lower one.
+    """Return the rates of two tanks' levels in cm; a pump fills the upper, which fills the lower.
 
     Torricelli's outflows; the flow of the pump, which has to rise to the level of the upper tank,
     falls with that; what is above the brim flows over.

@@ -32,7 +32,7 @@ def run(experiment: First, model: str, seed: int) -> Run:
 
 
 def tables(runs: Sequence[Run], experiment: First) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     trials = frame(runs, "trials", "trial")
     columns: dict[str, Any] = {
         "runs": of("seed", "nunique", ".0f"),

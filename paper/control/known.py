@@ -39,7 +39,7 @@ def run(experiment: Known, system: str, learner: str, seed: int) -> Run:
 
 
 def make_agent(settings: Known, system: str, learner: str, seed: int) -> tuple[MPCAgent, System]:
-    """The agent of a run, at its start, and what it controls."""
+    """Return the agent of a run, at its start, and the system that it controls."""
     known = MACHINES[system].system(_PHYSICS.get(learner, "crude"))
     task = known.task(dynamics(settings, known, learner))
     planner = partial(Planner, num_elites=settings.elites, correlation=0.5)
@@ -55,7 +55,7 @@ def make_agent(settings: Known, system: str, learner: str, seed: int) -> tuple[M
 
 
 def dynamics(settings: Known, known: System, learner: str) -> Dynamics:
-    """The model that is planned in, at its start."""
+    """Return the model in which plans are made, at its start."""
     physics = as_physics(known.physics)
     if learner in ("phy", "fitted", "oracle"):
         return PhysicsDynamics(known.spec, physics)
@@ -69,7 +69,7 @@ def dynamics(settings: Known, known: System, learner: str) -> Dynamics:
 
 
 def tables(runs: Sequence[Run], experiment: Known) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     trials = frame(runs, "trials")
     by_system = groups(trials, "system", _SYSTEMS)
     curves = [Curves(own, "cost") for own in by_system.values()]
@@ -91,12 +91,12 @@ def tables(runs: Sequence[Run], experiment: Known) -> dict[str, Table]:
 
 
 def _ratio(later: pd.DataFrame, other: str) -> Difference:
-    """The cost of CKA beside that of another in the later trials, pair by pair."""
+    """Return the ratio of CKA's cost to another's in the later trials, pair by pair."""
     return paired(later, "cost", "learner", "cka", other, ("system", "seed"), ratio=True)
 
 
 def _costs(curves: Curves, learner: str) -> str:
-    """The mean cost of each trial, with the standard error over the later ones, and few runs."""
+    """Return the mean cost of each trial, with the standard error over the later ones."""
     if learner not in curves.names:
         return ""
     means = "; ".join(number(mean, ".2f") for mean in curves.mean(learner))

@@ -46,7 +46,7 @@ class Machine:
     env: Callable[..., gym.Env[Any, Any]] | None = None
 
     def physics(self, kind: Physics = "crude") -> ODEPhysics:
-        """The next values of the states that move."""
+        """Return the next values of the states that move."""
         guesses = {name: known.guess for name, known in self.believed.items()}
         fixed = self.true if kind == "true" else dict.fromkeys(self.true, 0.0) | guesses
         return ODEPhysics(
@@ -59,12 +59,12 @@ class Machine:
         )
 
     def start(self, n: int) -> Tensor:
-        """States at which episodes start, ``n x state_dim``, by PyTorch's generator."""
+        """Draw states at which episodes start, ``n x state_dim``, by PyTorch's generator."""
         low, high = torch.tensor(self.starts, dtype=torch.float64)
         return low + (high - low) * torch.rand(n, len(low), dtype=torch.float64)
 
     def system(self, physics: Physics = "crude") -> System:
-        """The system with an f_p."""
+        """Return the system with an f_p."""
         return System(
             self.env or partial(MachineEnv, self),
             self.spec,

@@ -24,12 +24,12 @@ def _wrapped(angle: Tensor) -> Tensor:
 
 
 def _near(*errors: Tensor) -> Tensor:
-    """The reward of errors, each in the unit in which it is large: 0 if none, -1 if any is."""
+    """Return the reward of errors in units in which they are large: 0 if none, -1 if any is."""
     return torch.expm1(-torch.stack(errors).square().sum(0))
 
 
 def pendulum_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-    """Pendulum-v1's, of the state that was reached, by its largest cost."""
+    """Return Pendulum-v1's reward of the next state, divided by its largest cost."""
     theta, rate = _wrapped(next_states[:, 0]), next_states[:, 1]
     cost = theta.square() + 0.1 * rate.square() + 0.001 * actions[:, 0].square()
     return -cost / (math.pi**2 + 0.1 * 8**2 + 0.001 * 2**2)
@@ -93,7 +93,7 @@ Torques of at most 2 N m, held for 0.1 s, an episode of 5 s.
 
 
 def furuta_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-    """By the pendulum's angle from upright and the arm's from where it began."""
+    """Return a reward of the pendulum's angle from upright and the arm's from its start."""
     return _near(_wrapped(next_states[:, 1]) / 2, next_states[:, 0] / 2)
 
 
@@ -126,7 +126,7 @@ Masses and torque of f_p are 16 to 25 % off. At most 10 V, held for 0.04 s, an e
 
 
 def quadrotor_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-    """By the distance from the origin and the speed of turning."""
+    """Return a reward of the distance from the origin and the speed of turning."""
     x, z, _, _, _, turn = next_states.unbind(-1)
     return _near(x, z, turn / 10)
 
@@ -158,7 +158,7 @@ Thrusts of at most 6 N each, held for 0.05 s, an episode of 2 s.
 
 
 def double_pendulum_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-    """By the angles of both links from upright."""
+    """Return a reward of the angles of both links from upright."""
     first, second = next_states[:, 0] - math.pi, next_states[:, :2].sum(-1) - math.pi
     return _near(_wrapped(first) / 2, _wrapped(second) / 2)
 
@@ -192,7 +192,7 @@ of 2 s.
 
 
 def tanks_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-    """By the distance of the lower level from its set-point."""
+    """Return a reward of the distance of the lower level from its set-point."""
     return _near((next_states[:, 1] - next_states[:, 2]) / 2)
 
 

@@ -35,5 +35,5 @@ class Forrester(Experiment):
     quick: ClassVar[Mapping[str, Any]] = {}
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """All, but that the grids are of reading B alone."""
+        """Return all seeds; of the grids, for reading B alone."""
         return () if kind[0] == "A" and kind[1] in (GRID, OTHER) else self.seeds

@@ -92,7 +92,7 @@ def run(experiment: Forrester, reading: str, protocol: str, seed: int) -> Run:
 def models_of(
     reading: str, protocol: str, data: tuple[Tensor, Tensor], settings: Forrester
 ) -> dict[str, Callable[[], Model]]:
-    """What trains the models of a protocol, by their names."""
+    """Return the calls that train the models of a protocol, by the models' names."""
     if protocol == GRID:
         return {
             f"{lengthscale:g}, {ridge:g}": partial(
@@ -124,7 +124,7 @@ def trained(
 
 
 def load(runs: Sequence[Run], experiment: Forrester) -> pd.DataFrame:
-    """The scores: a row for each reading, protocol, seed and model."""
+    """Return the scores: a row for each reading, protocol, seed and model."""
     nothing = observations(0, 1)
     names = {name: [*models_of("B", name, nothing, experiment)] for name in (GRID, OTHER)}
     columns = (*_SCORES, "seconds")
@@ -133,7 +133,7 @@ def load(runs: Sequence[Run], experiment: Forrester) -> pd.DataFrame:
 
 
 def tables(runs: Sequence[Run], experiment: Forrester) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     scored = load(runs, experiment)
     grid, other = (part_of(scored, protocol=name) for name in (GRID, OTHER))
     found = {"rmse": Table("Reading B, mean / median RMSE", errors(part_of(scored, reading="B")))}
@@ -170,7 +170,7 @@ def tables(runs: Sequence[Run], experiment: Forrester) -> dict[str, Table]:
 
 
 def errors(runs: pd.DataFrame) -> str:
-    """Mean and median errors of one reading, a column for each protocol."""
+    """Return mean and median errors of one reading, a column for each protocol."""
 
     def both(part: pd.DataFrame) -> str:
         return f"{part['rmse'].mean():.3g} / {part['rmse'].median():.3g}"
@@ -270,12 +270,12 @@ def _uncertainty(runs: pd.DataFrame) -> Judged:
 
 
 def _wide(runs: pd.DataFrame, score: str = "rmse") -> pd.DataFrame:
-    """A score: a row for each seed, a column for each model."""
+    """Return a score: a row for each seed, a column for each model."""
     return runs.pivot(index="seed", columns="model", values=score)
 
 
 def _closed_form(rmse: pd.DataFrame, grid: pd.DataFrame) -> dict[str, Difference]:
-    """The change of each cell of the grid from the physics mean."""
+    """Return the change of each cell of the grid from the physics mean."""
     if grid.empty or rmse.empty:
         return {}
     cells = _wide(grid).drop(columns="f_p")
@@ -284,7 +284,7 @@ def _closed_form(rmse: pd.DataFrame, grid: pd.DataFrame) -> dict[str, Difference
 
 
 def _other_settings(runs: pd.DataFrame) -> dict[str, Difference]:
-    """The change of CKA from the physics mean with each of the other settings."""
+    """Return the change of CKA from the physics mean with each of the other settings."""
     rmse = _wide(runs)
     cells = [name.removeprefix("CKA, ") for name in rmse if name.startswith("CKA, ")]
     mean = {cell: rmse[f"Phy-mean GP, {cell}"] for cell in cells}
@@ -294,7 +294,7 @@ def _other_settings(runs: pd.DataFrame) -> dict[str, Difference]:
 
 
 def _grid(found: dict[str, Difference], row: str = "lengthscale", column: str = "ridge") -> str:
-    """A table of changes, whose names are those of a row and of a column."""
+    """Return a table of changes whose names are those of a row and of a column."""
     if not found:
         return "No results yet."
     names = sorted((cell.split(", ") for cell in found), key=lambda name: [*map(float, name)])

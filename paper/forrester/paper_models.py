@@ -25,7 +25,7 @@ _EXACT = 1e-5  # the noise of the low level of AR1, a share of its variance
 def closed_form(
     reading: str, X: Tensor, Y: Tensor, lengthscales: tuple[float, float], ridge: float
 ) -> PaperRRA:
-    """RRA as printed, with nothing learnt, by the lengthscales of rho and delta."""
+    """Return RRA as printed, with nothing learnt, by the lengthscales of rho and delta."""
     model = PaperRRA(X, Y, torch.full_like(Y, ridge), physics=CRUDE[reading])
     names = ("rho.kernel.lengthscale", "delta.kernel.lengthscale")
     values = {name: X.new_tensor(each) for name, each in zip(names, lengthscales, strict=True)}

@@ -10,22 +10,22 @@ POINTS = torch.linspace(LOWER, UPPER, 40, dtype=torch.float64).unsqueeze(-1)
 
 
 def forrester(X: Tensor) -> Tensor:
-    """The function of Forrester et al. (2007), ``(6 x - 2)^2 sin(12 x - 4)``."""
+    """Return the function of Forrester et al. (2007), ``(6 x - 2)^2 sin(12 x - 4)``."""
     return (6 * X - 2).square() * torch.sin(12 * X - 4)
 
 
 def truth(X: Tensor) -> Tensor:
-    """The paper's true function: a quarter of Forrester's."""
+    """Return the paper's true function: a quarter of Forrester's."""
     return forrester(X) / 4
 
 
 def crude_a(X: Tensor) -> Tensor:
-    """The crude function as printed, built on the true function with its quarter."""
+    """Return the crude function as printed, built on the true function with its quarter."""
     return (truth(X) / 2 + 10 * (X - 0.5) + 5) / 4
 
 
 def crude_b(X: Tensor) -> Tensor:
-    """The crude function built on Forrester's own, so that ``truth = 2 crude - 5 x``."""
+    """Return the crude function of Forrester's own, so that ``truth = 2 crude - 5 x``."""
     return (forrester(X) / 2 + 10 * (X - 0.5) + 5) / 4
 
 

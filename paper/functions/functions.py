@@ -48,7 +48,7 @@ class Data(NamedTuple):
 
 
 def data_of(name: str, n: int, num_test: int, seed: int) -> Data:
-    """The data set that a seed draws."""
+    """Draw the data set of a seed."""
     generator = torch.Generator().manual_seed(seed)
 
     def noisy(f: Tensor, sd: Any) -> Tensor:
@@ -88,7 +88,7 @@ def run(experiment: Functions, problem: str, n: int, learner: str, seed: int) ->
 
 
 def _least_squares(data: Data) -> Tensor:
-    """The formula with a factor and an offset, at the points."""
+    """Return the formula with a factor and an offset by least squares, at the points."""
     f_p, at = data.physics(data.X), data.physics(data.points)
     columns = torch.cat([f_p, torch.ones_like(f_p)], -1)
     found = torch.linalg.lstsq(columns, data.Y, driver="gelsd").solution
@@ -96,7 +96,7 @@ def _least_squares(data: Data) -> Tensor:
 
 
 def tables(runs: Sequence[Run], experiment: Functions) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     learners, parts = experiment.axes["learner"], _grouped(runs)
     found = parts["all"] = pd.concat(parts.values())
     worse: dict[str, Cell] = {
@@ -152,7 +152,7 @@ def _grouped(runs: Sequence[Run]) -> dict[str, pd.DataFrame]:
 
 
 def _ratios(part: pd.DataFrame, other: str) -> dict[tuple[Any, ...], Difference]:
-    """Logarithms of errors, CKA's over another's, cell by cell, paired by data set."""
+    """Return log ratios of CKA's errors to another's, by cell, paired by data set."""
     cells = {
         cell: paired(own, "error", "learner", "cka", other, ratio=True)
         for cell, own in part.groupby(_CELL, sort=False)

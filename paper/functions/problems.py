@@ -28,7 +28,7 @@ class Problem(NamedTuple):
     noise: float = 0.0  # standard deviation of observations, in that of the function
 
     def points(self, n: int, seed: int) -> Tensor:
-        """The first points of a scrambled Sobol sequence, ``n x d``."""
+        """Return the first points of a scrambled Sobol sequence, ``n x d``."""
         engine = SobolEngine(self.num_inputs, scramble=True, seed=seed)
         return engine.draw(n, dtype=torch.float64)
 
@@ -49,29 +49,29 @@ def _add(
 
 
 def _beam(a: Tensor, b: Tensor, shear: float) -> Tensor:
-    """Deflection by length (1 to 3) and height (1 to 2)."""
+    """Return the deflection by length (1 to 3) and height (1 to 2)."""
     length, height = 1 + 2 * a, 1 + b
     return length**3 / height**3 + shear * length / height
 
 
 def _throttle(a: Tensor, b: Tensor) -> Tensor:
-    """Flow by opening and pressure."""
+    """Return the flow by opening and pressure."""
     return (0.1 + 0.9 * a) * (0.2 + b) ** 0.5
 
 
 def _uptake(a: Tensor, b: Tensor, half: float, inhibition: float) -> Tensor:
-    """Rate by two concentrations, of which one inhibits."""
+    """Return the rate by two concentrations, of which one inhibits."""
     return 5 * a / (half * (1 + inhibition * 3 * b) + 5 * a)
 
 
 def _lens(a: Tensor, b: Tensor, c: Tensor, thickness: float = 0.0) -> Tensor:
-    """Power of a lens by its two curvatures and its index."""
+    """Return the power of a lens by its two curvatures and its index."""
     one, two, index = 0.5 + a, 0.3 + b, 0.4 + 0.4 * c
     return index * (one - two + thickness * index / (1 + index) * one * two)
 
 
 def _pipe(a: Tensor, b: Tensor, c: Tensor, exponent: float = 1.5, rough: float = 0.0) -> Tensor:
-    """Loss of pressure by flow, diameter and length."""
+    """Return the loss of pressure by flow, diameter and length."""
     flow, diameter, length = 0.2 + a, 0.6 + 0.6 * b, 0.3 + c
     return length * flow**exponent / diameter**3 * (1 + rough * flow)
 
@@ -129,7 +129,7 @@ def _currin(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _around(x: Tensor, y: Tensor) -> Tensor:
-    """Currin's function at four points around each."""
+    """Return the mean of Currin's function at four points around each."""
     steps = ((0.05, 0.05), (0.05, -0.05), (-0.05, 0.05), (-0.05, -0.05))
     return sum((_currin(x + a, (y + b).clamp_min(0)) / 4 for a, b in steps), 0 * x)
 
@@ -146,7 +146,7 @@ def _booth(x: Tensor, y: Tensor) -> Tensor:
 def _in_bounds(
     function: Callable[..., Tensor], low: float, high: float, low_2: float, high_2: float
 ) -> Callable[..., Tensor]:
-    """A function of two inputs in their bounds, as one of the unit square."""
+    """Return a function of two inputs in their bounds, as one of the unit square."""
     return lambda a, b: function(low + (high - low) * a, low_2 + (high_2 - low_2) * b)
 
 

@@ -32,5 +32,5 @@ class Kinds(Experiment):
     )
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """All; of the balls, whose data are given, two seeds of the fit."""
+        """Return all seeds; of the balls, whose data are given, two of the fit."""
         return self.seeds[:2] if kind[0] == "balldrop" else self.seeds

@@ -71,13 +71,13 @@ def _at(model: Any, test: Tensor, truth: Tensor, line: Tensor, data: Any) -> Pre
 
 
 def _line(function: Callable[[Tensor], Tensor], low: float = 0.0, high: float = 1.0) -> Tensor:
-    """Points of one input with the truth as a further column."""
+    """Return points of one input with the truth as a further column."""
     x = torch.linspace(low, high, _LINE, dtype=torch.float64).unsqueeze(-1)
     return torch.cat([x, function(x)], -1)
 
 
 def relative(option: bool, seed: int) -> Predicted:
-    """Noise of 5 % of an output that grows by three decades; errors are of its logarithm."""
+    """Predict an output of three decades with noise of 5 %; errors are of its logarithm."""
     draw = np.random.default_rng(seed)
 
     def physics(X: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ def relative(option: bool, seed: int) -> Predicted:
 
 
 def outliers(option: bool, seed: int) -> Predicted:
-    """Two of forty observations are off by 10 to 100 sd."""
+    """Predict from forty observations, of which two are off by 10 to 100 sd."""
     draw = np.random.default_rng(seed)
 
     def truth(X: Tensor) -> Tensor:
@@ -113,7 +113,7 @@ def outliers(option: bool, seed: int) -> Predicted:
 
 
 def noisy_inputs(option: bool, seed: int) -> Predicted:
-    """Inputs with an error of 5 % of their range; test inputs are exact."""
+    """Predict from inputs with an error of 5 % of their range; test inputs are exact."""
     draw = torch.Generator().manual_seed(seed)
 
     def truth(X: Tensor) -> Tensor:
@@ -130,7 +130,7 @@ def noisy_inputs(option: bool, seed: int) -> Predicted:
 
 
 def links(option: bool, seed: int) -> Predicted:
-    """The current of a diode with a leak and a series resistance; errors are of its logarithm."""
+    """Predict the current of a diode with leak and resistance; errors are of its logarithm."""
     draw = np.random.default_rng(seed)
     ideal, leak = draw.uniform(1.05, 1.3), draw.uniform(1e-7, 1e-5)
 
@@ -154,12 +154,12 @@ _CONSTANTS = torch.tensor([0.9, 1.3, 1.1], dtype=torch.float64)  # of the materi
 
 
 def _head(X: Tensor) -> Tensor:
-    """The head of a pump by flow, speed and material."""
+    """Return the head of a pump by flow, speed and material."""
     return 20 * X[:, 1].square() - 4 * _CONSTANTS[X[:, 2].long()] * X[:, 0].square()
 
 
 def categories(option: bool, seed: int) -> Predicted:
-    """Pumps of three materials on rigs with an offset each; plain: their codes as numbers."""
+    """Predict pumps of three materials on rigs with an offset each; plain: codes as numbers."""
     draw = np.random.default_rng(seed)
     slips = torch.from_numpy(draw.uniform(0.5, 3.0, 3))
     offsets = torch.from_numpy(draw.normal(size=5))
@@ -186,7 +186,7 @@ def categories(option: bool, seed: int) -> Predicted:
 
 
 def drift(option: bool, seed: int) -> Predicted:
-    """The head of a pump that wears; the option is updated with each observation and forgets."""
+    """Predict the head of a pump that wears; the option forgets as it is updated."""
     draw, steps, first = np.random.default_rng(seed), 360, 60
     flow, speed = draw.uniform(0.2, 1.2, steps), draw.uniform(0.7, 1.1, steps)
     worn = draw.uniform(0.04, 0.08) + 0.04 * np.arange(steps) / steps
@@ -214,7 +214,7 @@ def drift(option: bool, seed: int) -> Predicted:
 
 
 def vanishing(option: bool, seed: int) -> Predicted:
-    """Gravity of a ball in air: f_p has no drag, which is small at first; plain: a free delta."""
+    """Predict a ball's fall in air: f_p has no drag, which is small at first; plain: free delta."""
     draw = np.random.default_rng(seed)
     height, drag, g = draw.uniform(40, 60), draw.uniform(0.002, 0.02), 9.81
 
@@ -236,7 +236,7 @@ def vanishing(option: bool, seed: int) -> Predicted:
 
 
 def emulated(option: bool, seed: int) -> Predicted:
-    """Currin's function; its low level is known by 40 runs. Plain: their emulator is exact."""
+    """Predict Currin's function, its low level by 40 runs; plain: their emulator is exact."""
     problem = PROBLEMS["currin"]
     X, runs = problem.points(10, seed), problem.points(40, 20_000 + seed)
     known = EmulatedPhysics(runs, problem.physics(runs))
@@ -253,13 +253,13 @@ _SOFTBALL = 0.0485  # m, its radius
 
 
 def _drop_time(X: Tensor) -> Tensor:
-    """The formula that the runs follow, with drag and gravity at the middle of their priors."""
+    """Return the time by the runs' formula, drag and gravity at the middle of their priors."""
     k = 3 * 1.1 * 1.184 / (8 * X[:, 0] * X[:, 1])
     return torch.acosh((k * X[:, 2]).exp()) / (10.0 * k).sqrt()
 
 
 def balldrop(option: bool, seed: int) -> Predicted:
-    """Times of a softball, by those of three other balls and 80 runs of a simulator.
+    """Predict times of a softball, by those of three other balls and 80 runs of a simulator.
 
     Data, runs and priors are those of the documentation of SEPIA (lanl/SEPIA at 3098904, notebook
     `ball_drop_2`). Plain: their formula with guesses of drag and gravity, adjusted by CKA.
@@ -322,7 +322,7 @@ def run(experiment: Kinds, kind: str, learner: str, seed: int) -> Run:
 
 
 def tables(runs: Sequence[Run], experiment: Kinds) -> dict[str, Table]:
-    """A row for each kind."""
+    """Return a table with a row for each kind."""
     columns: dict[str, Cell] = {
         "plain": lambda part: OPTIONS[part["kind"].iloc[0]][0],
         "option": lambda part: f"`{OPTIONS[part['kind'].iloc[0]][1]}`",

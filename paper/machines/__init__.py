@@ -45,7 +45,7 @@ class Real(Experiment):
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "scipy")
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """One run of what learns nothing; the pendulum's records have 300 transitions at most.
+        """Return the seeds: one of what learns nothing, none for more rows than a record has.
 
         Unknown parameters, whose fits take minutes, are learnt of 100 transitions alone.
         """
@@ -57,7 +57,7 @@ class Real(Experiment):
         return () if n == 400 and system == "pendulum" else self.seeds
 
     def describe(self, *kind: Any) -> dict[str, Any]:
-        """The settings of a run, and the records and parameters of its system."""
+        """Return the settings of a run, and the records and parameters of its system."""
         from paper.machines.records import REAL
 
         scored = {"horizons": list(HORIZONS), "start_noise": "learnt"}
@@ -97,6 +97,6 @@ class Tanks(Experiment):
     single: ClassVar[tuple[str, ...]] = ("fitted",)
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """Without f_p those of the GP alone."""
+        """Return the seeds; without f_p, of the GP alone."""
         sensor, learner = kind
         return () if (sensor == "none") != (learner == "gp") else super().seeds_of(*kind)

@@ -77,7 +77,7 @@ class NetworkDynamics(Dynamics):
         return self._networks is not None
 
     def physics_alone(self) -> Dynamics:
-        """What there is before transitions."""
+        """Return the dynamics before any transitions."""
         return self.known
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
@@ -99,19 +99,19 @@ class NetworkDynamics(Dynamics):
         self._networks = networks.requires_grad_(False)
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
-        """The mean over the networks; the variance over them, and that of the noise."""
+        """Return the mean over the networks; the variance over them, and that of the noise."""
         each = self._of_all(states, actions)
         return Prediction(each.mean(0), each.var(0) + self.noise_variance(states, actions))
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """Networks, in a random order."""
+        """Return networks, in a random order."""
         generator = None if seed is None else torch.Generator().manual_seed(seed)
         order = torch.randperm(self.number, generator=generator)
         taken = order[torch.arange(num_functions) % self.number]
         return lambda states, actions: self._each(states, actions, taken)
 
     def mean_function(self) -> TransitionFunctions:
-        """The mean of all networks."""
+        """Return the mean of all networks."""
 
         def step(states: Tensor, actions: Tensor) -> Tensor:
             actions = actions.expand(*states.shape[:-1], -1)
@@ -121,7 +121,7 @@ class NetworkDynamics(Dynamics):
         return step
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The mean square of the errors at the rows that were held out."""
+        """Return the mean square of the errors at the rows that were held out."""
         return self.spec.complete_variance(self._noise.expand(*states.shape[:-1], -1))
 
     def _train(self, networks: Networks, X: Tensor, Y: Tensor, shares: Tensor) -> Tensor:
@@ -152,7 +152,7 @@ class NetworkDynamics(Dynamics):
         return errors.mean(0)
 
     def _inputs(self, states: Tensor, actions: Tensor) -> Tensor:
-        """States but exogenous ones, with sine and cosine of angles, and actions."""
+        """Return states but exogenous ones, with sine and cosine of angles, and actions."""
         columns = []
         for i in self._read:
             x = states[..., i]
@@ -164,7 +164,7 @@ class NetworkDynamics(Dynamics):
         return (X - mean) / sd
 
     def _physics(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The change of the predicted states by f_p, ``... x m``."""
+        """Return the change of the predicted states by f_p, ``... x m``."""
         actions = actions.expand(*states.shape[:-1], -1)
         following = self.known.mean_function()(states, actions)
         return self.spec.change(states, following)[..., self.spec.predicted]
@@ -174,7 +174,7 @@ class NetworkDynamics(Dynamics):
             return self._each(states.expand(self.number, *states.shape), actions, slice(None))
 
     def _each(self, states: Tensor, actions: Tensor, which: Any) -> Tensor:
-        """Next states ``k x N x state_dim`` by some of the networks."""
+        """Return next states ``k x N x state_dim`` by some of the networks."""
         assert self._networks is not None, "asked before"
         rest = self._networks(self._normalized(self._inputs(states, actions)), which)
         change = self._physics(states, actions) + self._shift + self._scale * rest

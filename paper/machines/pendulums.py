@@ -54,7 +54,7 @@ class Machine:
         }
 
     def physics(self, parameters: str | Parameters = "unknown") -> ODEPhysics:
-        """A control step by unknown parameters, by those that are known so, or by these."""
+        """Return a control step, its parameters unknown, or by the name of a set, or given."""
         options: dict[str, Any] = {
             "step": STEP,
             "state_dim": self.spec.state_dim,
@@ -73,7 +73,7 @@ def _friction(rate: Tensor, viscous: Any, coulomb: Any) -> Tensor:
 
 
 def double_pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
-    """Two links with geared drives, by the nine sums of masses that can be told apart.
+    """Return the rates of two links with geared drives, by nine sums of masses.
 
     ``inertia_1`` is :math:`I_1 + m_2 l_1^2`, ``inertia_2`` :math:`I_2`, ``moment_1``
     :math:`m_1 r_1 + m_2 l_1` and ``moment_2`` :math:`m_2 r_2`, with inertias about the joints, and
@@ -100,7 +100,7 @@ def double_pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tens
 
 
 def pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
-    """A rigid body on a drive: its inertia about the joint, ``moment`` :math:`m l`, friction."""
+    """Return the rates of a rigid body on a drive, of ``moment`` :math:`m l`, with friction."""
     q, dq = state.unbind(-1)
     torque = action[:, 0] - _GRAVITY * p["moment"] * q.sin()
     torque = torque - _friction(dq, p["viscous"], p["coulomb"])
@@ -110,7 +110,7 @@ def pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
 def sums_of_masses(
     first: tuple[float, float, float], second: tuple[float, float, float], *friction: float
 ) -> Parameters:
-    """The parameters of a double pendulum from mass, inertia and center of mass of its links.
+    """Return the parameters of a double pendulum by masses, inertias and centers of its links.
 
     Friction is viscous and Coulomb of the first joint, then of the second.
     """

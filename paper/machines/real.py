@@ -87,7 +87,7 @@ def run(experiment: Real, name: str, n: int, learner: str, seed: int) -> Run:
 def _scores(
     dynamics: Dynamics, noise: Tensor | None, known: System, test: str, experiment: Real
 ) -> tuple[Any, Any]:
-    """Scores by name and steps ahead, and the free runs of which they are.
+    """Return scores by name and steps ahead, and their free runs.
 
     Those of one step are of all steps of the test. If the noise of what is measured is known, the
     dynamics learnt process noise; else half of what they learnt is that of a state (the windows
@@ -112,7 +112,7 @@ def _scores(
 
 
 def _lost(known: System) -> dict[str, Any]:
-    """Scores of free runs without an end: infinite errors, and no value in an interval."""
+    """Return scores of free runs without an end: infinite errors, and intervals without values."""
     d = len(known.machine.spec.states)
     steps = [str(ahead) for ahead in (1, *HORIZONS)]
     return {
@@ -122,7 +122,7 @@ def _lost(known: System) -> dict[str, Any]:
 
 
 def _paths(known: System, free: Any) -> dict[str, Any]:
-    """A few free runs of the last angle: which windows they are, means and ends of intervals."""
+    """Return a few free runs of the last angle: windows, means and ends of intervals."""
     rows = torch.linspace(0, len(free.mean) - 1, _KEPT + 2).round().long()[1:-1].unique()
     angle = known.machine.spec.angle_columns[-1]
     parts = {"mean": free.mean, "lower": free.lower, "upper": free.upper}
@@ -130,7 +130,7 @@ def _paths(known: System, free: Any) -> dict[str, Any]:
 
 
 def load(runs: Sequence[Run]) -> pd.DataFrame:
-    """A row for each test of each run: the last angle's error, mean coverage, by steps ahead."""
+    """Return a row for each test of each run: the last angle's error, mean coverage, by steps."""
     rows = []
     for each in runs:
         angle = REAL[each["system"]].machine.spec.angle_columns[-1]
@@ -145,7 +145,7 @@ def load(runs: Sequence[Run]) -> pd.DataFrame:
 
 
 def tables(runs: Sequence[Run], experiment: Real) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     scored, axes = load(runs), experiment.axes
     found = {"paired": Table("n = 100, beside least squares by the same draws", _paired(scored))}
     for (name, test), own in scored.groupby(["system", "test"], sort=False):
@@ -169,7 +169,7 @@ def _ahead(steps: int) -> str:
 
 
 def _paired(scored: pd.DataFrame) -> str:
-    """Errors of n = 100 beside those of least squares, and of CKA beside its delta alone."""
+    """Return ratios of errors at n = 100 to least squares, and of CKA to its delta alone."""
     at = part_of(scored, n=100)
     columns: dict[str, Cell] = {}
     for name, test, steps in ((DRAWN, "near", 20), (DRAWN, "far", 20), ("pendulum", "sac", 10)):

@@ -38,7 +38,7 @@ class System:
     moves: float = 0.0  # a rate in rad/s that what is tested at reaches
 
     def describe(self) -> dict[str, Any]:
-        """Everything that decides what is learnt, in plain values."""
+        """Return all that decides what is learnt, in plain values."""
         return {
             "step": STEP,
             "substeps": SUBSTEPS,
@@ -49,7 +49,7 @@ class System:
         }
 
     def drawn(self, n: int, seed: int) -> Trajectories:
-        """``n`` transitions to learn from, spread over the records.
+        """Return ``n`` transitions to learn from, spread over the records.
 
         Raises:
             ValueError: If the records have fewer.
@@ -57,7 +57,7 @@ class System:
         return self._records(self.train).trajectories(STEP).spread(n, seed)
 
     def stretches(self, n: int, seed: int) -> Records:
-        """``n`` transitions in stretches of ten, or as many as divide ``n``, spread alike.
+        """Return ``n`` transitions in stretches of ten, or as many as divide ``n``, spread alike.
 
         Raises:
             ValueError: If the records have fewer.
@@ -67,19 +67,19 @@ class System:
         return Records.of_windows(found, self.machine.spec, STEP)
 
     def steps(self, test: str) -> Trajectories:
-        """The single steps of a test that start where the machine moves."""
+        """Return the single steps of a test that start where the machine moves."""
         data = self._records(self.tests[test]).trajectories(STEP)
         return data.subset(self._fast(data.states).nonzero().flatten())
 
     def windows(self, test: str, length: int, number: int) -> Windows:
-        """So many windows of a test in which the machine moves, evenly spread."""
+        """Return so many windows of a test in which the machine moves, evenly spread."""
         found = self._records(self.tests[test]).windows(length, STEP, stride=1)
         rows = self._fast(found.states).any(1).nonzero().flatten()
         places = torch.linspace(0, len(rows) - 1, min(number, len(rows))).round().long()
         return found.subset(rows[places])
 
     def _fast(self, states: Tensor) -> Tensor:
-        """Mask of states with a rate above the threshold; rates are the second half of a state."""
+        """Return a mask of states with a rate above the threshold, in a state's second half."""
         rates = states[..., states.shape[-1] // 2 :]
         return (rates.abs() >= self.moves).any(-1)
 

@@ -23,7 +23,7 @@ from paper.published import published
 
 @cache
 def fitted(sensor: str, experiment: Tanks) -> SmoothedRecords:
-    """Parameters of f_p, and where the upper tank began, by the estimation record."""
+    """Fit parameters of f_p, and where the upper tank began, to the estimation record."""
     noise = torch.tensor([torch.nan, experiment.noise], dtype=torch.float64)
     scatter = torch.tensor(CHOSEN[sensor], dtype=torch.float64)
     return smooth(
@@ -81,7 +81,7 @@ def run(experiment: Tanks, sensor: str, learner: str, seed: int) -> Run:
 
 
 def tables(runs: Sequence[Run], experiment: Tanks) -> dict[str, Table]:
-    """A row for each learner, beside published errors."""
+    """Return a table with a row for each learner, and published errors."""
     axes = experiment.axes
     columns: dict[str, Cell] = {
         "RMSE, V": mean_error("rmse", ".3f"),

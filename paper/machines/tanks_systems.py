@@ -50,7 +50,7 @@ _BRIM = 10.1  # V, of the lower tank
 
 
 def rates(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
-    r"""Rates of the levels in V/s: Torricelli's outflow, and overflow.
+    r"""Return the rates of the levels in V/s: Torricelli's outflow, and overflow.
 
     The sensor says y of the lower level :math:`h = 5 s^r - d \tanh((y - c) / w)` with
     :math:`s = (y - e) / (5 - e)`, in a unit in which both are 5 near the middle.
@@ -70,7 +70,7 @@ def rates(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
 
 
 def physics(structure: str, values: Mapping[str, float] | None = None) -> ODEPhysics:
-    """The next levels, with unknown parameters, or these."""
+    """Return the next levels, with unknown parameters, or these."""
     fixed: dict[str, Any] = {**FIXED[structure], **(values or {})}
     unknowns = {name: known for name, known in UNKNOWNS.items() if name not in fixed}
     options: dict[str, Any] = {"step": STEP, "state_dim": 2, "substeps": 4}
@@ -82,7 +82,7 @@ def physics(structure: str, values: Mapping[str, float] | None = None) -> ODEPhy
 
 
 def measured(part: str, samples: int) -> tuple[Tensor, Tensor]:
-    """Actions and levels of a record, ``samples`` each; of ``"Est"`` or ``"Val"``."""
+    """Return actions and levels of a record, ``samples`` each; of ``"Est"`` or ``"Val"``."""
     spec = StateSpec(["lower"], ["pump"])
     columns: dict[str, Any] = {"states": {"lower": f"y{part}"}, "actions": {"pump": f"u{part}"}}
     file = DATA / "tanks" / "dataBenchmark.csv"
@@ -91,7 +91,7 @@ def measured(part: str, samples: int) -> tuple[Tensor, Tensor]:
 
 
 def levels(actions: Tensor, lower: Tensor) -> Records:
-    """A record of both tanks: the upper level is hidden, and what the full sensor says unknown."""
+    """Return a record of both tanks; the upper level and a full sensor's values are hidden."""
     lower = lower.where(lower < FULL - 0.01, torch.nan)
     states = torch.stack([torch.full_like(lower, torch.nan), lower], dim=-1)
     times = STEP * torch.arange(len(lower), dtype=torch.float64)
@@ -99,7 +99,7 @@ def levels(actions: Tensor, lower: Tensor) -> Records:
 
 
 def outputs(actions: Tensor, lower: Tensor) -> Records:
-    """A record of the lower tank alone, as the sensor says, with the level and action before."""
+    """Return a record of the lower tank alone, with the level and action before."""
     previous = {"lower_1": "lower", "pump_1": "pump"}
     spec = StateSpec(["lower", *previous], ["pump"], previous=previous)
     states = torch.full((len(lower), spec.state_dim), torch.nan, dtype=torch.float64)

@@ -39,14 +39,14 @@ def _peak(X: Tensor, middle: list[float], widths: list[float], height: float) ->
 
 
 def _reactor(X: Tensor, rate: float, loss: float, energy: float) -> Tensor:
-    """Yield of B in A -> B -> C, in per cent, by time (0.2 to 5 h) and temperature (300 to 360)."""
+    """Return the yield of B in A -> B -> C, in per cent, by time (0.2-5 h) and heat (300-360)."""
     time, heat = 0.2 + 4.8 * X[:, 0], (X[:, 1] * 60 - 30) / 330
     one, two = rate * (4 * heat).exp(), loss * (energy * heat).exp()
     return 100 * one / (two - one) * ((-one * time).exp() - (-two * time).exp())
 
 
 def _column(X: Tensor, shift: float, curvature: float) -> Tensor:
-    """Profit of a column by reflux, feed and pressure."""
+    """Return the profit of a column by reflux, feed and pressure."""
     best = X.new_tensor([0.35 + shift, 0.6 - shift, 0.75])
     return 20 - (curvature * (X - best).square() * X.new_tensor([40.0, 25.0, 30.0])).sum(-1)
 
@@ -125,7 +125,7 @@ def run(experiment: Misled, problem: str, method: str, seed: int) -> Run:
 
 
 def _range(problem: Problem) -> tuple[float, float]:
-    """The largest value of a function, and how far it is above the least."""
+    """Return the largest value of a function, and how far it is above the least."""
     engine = SobolEngine(problem.num_inputs, scramble=True, seed=0)
     X = engine.draw(_GRID, dtype=torch.float64)
     values = problem.truth(X)
@@ -141,7 +141,7 @@ def _range(problem: Problem) -> tuple[float, float]:
 
 
 def _fitted(method: str, X: Tensor, Y: Tensor, problem: Problem) -> tuple[Model, float | None]:
-    """A model, and what is the probability that its physics is of use, if it says so."""
+    """Return a model, and the probability that its physics is of use, if it has one."""
     if method == "stgp":
         plain = SingleTaskGP(X, Y, outcome_transform=Standardize(1))
         fit_gpytorch_mll(ExactMarginalLogLikelihood(plain.likelihood, plain))
@@ -153,7 +153,7 @@ def _fitted(method: str, X: Tensor, Y: Tensor, problem: Problem) -> tuple[Model,
 
 
 def tables(runs: Sequence[Run], experiment: Misled) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     found = frame(runs)
     found["last"] = [regrets[-1] for regrets in found["regrets"]]
     # A search without a trial below 1 % finds the optimum never.

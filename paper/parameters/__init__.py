@@ -42,7 +42,7 @@ class Parameters(Experiment):
     )
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """All; of right laws without a discrepancy alone."""
+        """Return all seeds; for right laws, without a discrepancy alone."""
         return self.seeds if kind[0] in TEXTBOOK or kind[1] == "physics" else ()
 
 

@@ -63,7 +63,7 @@ class Case:
 
 
 def case(name: str, seed: int, number: int | None = None, places: int | None = None) -> Case:
-    """The case of a problem that a seed draws, with another number of inputs, at other places."""
+    """Draw the case of a problem and a seed, with another number of inputs, at other places."""
     problem = PROBLEMS[name]
     generator = torch.Generator().manual_seed(seed)
     low, high = torch.tensor(problem.box, dtype=torch.float64)
@@ -79,45 +79,45 @@ def case(name: str, seed: int, number: int | None = None, places: int | None = N
 
 
 def _beam(X: Tensor, p: ParameterValues) -> Tensor:
-    """Deflection of a cantilever in a joint that gives, by load and length."""
+    """Return the deflection of a cantilever in a joint that gives, by load and length."""
     load, length = X.T
     return 10 * load * (length**3 / (3 * p.EI) + length**2 / p.kr)
 
 
 def _reaction(X: Tensor, p: ParameterValues) -> Tensor:
-    """Conversion after an hour by temperature in K, with a rate by Arrhenius."""
+    """Return the conversion after an hour by temperature in K, with a rate by Arrhenius."""
     return 1 - (-(p.logA - p.E / (8.314e-3 * X[:, 0])).exp()).exp()
 
 
 def _creep(X: Tensor, p: ParameterValues) -> Tensor:
-    """Strain of a spring beside a dashpot under a constant load, before it comes to rest."""
+    """Return the strain of a spring and a dashpot under a constant load, before rest."""
     return (1 - (-X[:, 0] * p.E / p.eta).exp()) / p.E
 
 
 def _inhibited(X: Tensor, p: ParameterValues) -> Tensor:
-    """Rate of an enzyme by its substrate and an inhibitor."""
+    """Return the rate of an enzyme by its substrate and an inhibitor."""
     substrate, inhibitor = X.T
     return p.V * substrate / (p.K * (1 + inhibitor / p.Ki) + substrate)
 
 
 def _spectrum(X: Tensor, p: ParameterValues) -> Tensor:
-    """Three peaks."""
+    """Return three peaks."""
     peaks = ((p[f"a{i}"], p[f"c{i}"], p[f"w{i}"]) for i in (1, 2, 3))
     return sum((a * (-0.5 * ((X[:, 0] - c) / w).square()).exp() for a, c, w in peaks), 0 * X[:, 0])
 
 
 def _pendulum(X: Tensor, p: ParameterValues) -> Tensor:
-    """Angle by time, of a swing of either sign and phase."""
+    """Return the angle by time, of a swing of either sign and phase."""
     return p.swing * (3 * X[:, 0] + p.phase).sin()
 
 
 def _square(X: Tensor, p: ParameterValues) -> Tensor:
-    """A lens that is out of focus either way, by aperture."""
+    """Return the blur of a lens that is out of focus either way, by aperture."""
     return (p.focus - 1).square() * X[:, 0] + p.rest
 
 
 def _alias(X: Tensor, p: ParameterValues) -> Tensor:
-    """An oscillation that is observed too seldom."""
+    """Return an oscillation that is observed too seldom."""
     return p.size * (p.rate * X[:, 0]).cos()
 
 
@@ -159,7 +159,7 @@ PROBLEMS = {
 
 
 def textbook_case(problem: str, seed: int) -> Case:
-    """The case of a textbook problem that a seed draws."""
+    """Draw the case of a textbook problem and a seed."""
     draw = np.random.default_rng(seed)
     law, unknowns, X, system, noise, true = _TEXTBOOK[problem](draw)
     generator = torch.Generator().manual_seed(1000 + seed)

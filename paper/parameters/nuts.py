@@ -83,7 +83,7 @@ def run(experiment: Nuts, problem: str, method: str, seed: int) -> Run:
 
 
 def tables(runs: Sequence[Run], experiment: Nuts) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     rows = []
     for problem, label in experiment.axes["problem"].items():
         own = [run for run in runs if run["problem"] == problem]

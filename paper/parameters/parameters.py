@@ -34,7 +34,7 @@ def run(experiment: Parameters, problem: str, model: str, seed: int) -> Run:
 
 
 def tables(runs: Sequence[Run], experiment: Parameters) -> dict[str, Table]:
-    """A row for each parameter of each model; the laws whose parameters fold in one table."""
+    """Return a row for each parameter of each model; laws whose parameters fold in one table."""
     found, axes = load(runs), experiment.axes
     columns: dict[str, Cell] = {
         "cases": len,
@@ -57,7 +57,7 @@ def tables(runs: Sequence[Run], experiment: Parameters) -> dict[str, Table]:
 
 
 def load(runs: Sequence[Run]) -> pd.DataFrame:
-    """A row for each parameter of each case and model."""
+    """Return a row for each parameter of each case and model."""
     rows = []
     for run in runs:
         shared = {key: run[key] for key in ("problem", "model", "rmse", "coverage", "seconds")}

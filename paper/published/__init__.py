@@ -17,7 +17,7 @@ BOOSTING = "boosted trees, formula as an input"
 
 
 def published(experiment: str) -> dict[str, list[str]]:
-    """Published numbers that stand below those of an experiment, by the method."""
+    """Return published numbers that stand below those of an experiment, by the method."""
     with open(Path(__file__).parent / "data" / "published.csv", newline="") as file:
         return {row[1]: row[2:] for row in csv.reader(file) if row[0] == experiment}
 
@@ -65,7 +65,7 @@ class Uci(Splits):
     packages: ClassVar[tuple[str, ...]] = (*Splits.packages, "smt")
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """All splits, three of the large tables by nine tenths; of what is slow, few rows alone."""
+        """Return all splits; three of large tables by nine tenths; few rows for slow methods."""
         table, share, method = kind
         if method in ("mfk", "boosting", "phymean") and share > 0.1:
             return ()
@@ -188,7 +188,7 @@ class Masses(Experiment):
     calls: ClassVar[tuple[str, ...]] = _CALLS
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """The folds that are left out; one run of the other tasks."""
+        """Return the folds that are left out; one run of the other tasks."""
         task, physics, model = kind
         if (physics == "none") != (model == "gp"):
             return ()

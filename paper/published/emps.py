@@ -54,7 +54,7 @@ AUTHORS = {
 
 
 def measured(name: str, experiment: Emps) -> tuple[Tensor, Tensor]:
-    """Positions in m and mean forces in N of steps; between rows the force is linear."""
+    """Return positions in m and mean forces in N of steps; between rows the force is linear."""
     file = pd.read_csv(DATA / f"{name}.csv")[: experiment.rows]
     q, volts = (torch.from_numpy(file[c].to_numpy(copy=True)) for c in ("q", "force_in"))
     force = _NEWTON * torch.cat([(volts[1:] + volts[:-1]) / 2, volts[-1:]])
@@ -64,13 +64,13 @@ def measured(name: str, experiment: Emps) -> tuple[Tensor, Tensor]:
 
 
 def spec_of(experiment: Emps) -> StateSpec:
-    """Position and velocity, of which models predict the latter alone."""
+    """Return position and velocity, of which models predict the latter alone."""
     step = _SAMPLING * experiment.every
     return StateSpec(["q", "v"], ["force"], step=step, integrated={"q": "v"})
 
 
 def physics(step: float, values: Sequence[float] | None = None) -> FunctionPhysics:
-    r"""The next position and velocity, with unknown parameters or these.
+    r"""Return the next position and velocity, with unknown parameters or these.
 
     :math:`M q'' = F - F_v q' - F_c \operatorname{sign} q' - c` (Janot et al. 2019). Dry friction
     decelerates, or holds what it has stopped, in each of five substeps.
@@ -90,7 +90,7 @@ def physics(step: float, values: Sequence[float] | None = None) -> FunctionPhysi
 
 @cache
 def smoothed(experiment: Emps) -> SmoothedRecords:
-    """States and parameters by the estimation record, which has no velocities."""
+    """Smooth the estimation record, which has no velocities, with f_p's parameters."""
     q, force = measured("estimation", experiment)
     spec = spec_of(experiment)
     states = torch.stack([q, torch.full_like(q, torch.nan)], dim=-1)
@@ -141,7 +141,7 @@ def run(experiment: Emps, learner: str, seed: int) -> Run:
 
 
 def tables(runs: Sequence[Run], experiment: Emps) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     columns: dict[str, Cell] = {
         "runs": len,
         "RMSE, mm": mean_error("rmse", ".2f"),
@@ -169,7 +169,7 @@ def tables(runs: Sequence[Run], experiment: Emps) -> dict[str, Table]:
 
 
 def _pooled(own: pd.DataFrame) -> str:
-    """The states are not known: the error of the mean of free runs of all that they may be."""
+    """Return the error of the mean of free runs of all draws of the states, which are unknown."""
     off = np.mean([path["off"] for path in own["path"]], axis=0)
     return number(float(np.sqrt(np.mean(off**2))), ".2f") if len(own) > 1 else ""
 

@@ -38,7 +38,7 @@ _ROWS = 125  # of a path that is kept
 
 @cache
 def smoothed(record: str, experiment: Freeruns) -> SmoothedRecords:
-    """States and parameters by the first part of a record."""
+    """Smooth the first part of a record, with f_p's parameters."""
     system, given = SYSTEMS[record], dict[str, Any]()
     if system.noise is not None:
         whole = (*system.noise, *[1.0] * system.delay)  # earlier actions have none
@@ -75,7 +75,7 @@ def run(experiment: Freeruns, record: str, learner: str, seed: int) -> Run:
 
 
 def _followed(experiment: Freeruns, record: str, learner: str, seed: int) -> FreeRun:
-    """A free run; a GP without f_p reads outputs and actions, beside f_p its states."""
+    """Return a free run; a GP without f_p reads outputs and actions, others the states of f_p."""
     system, rows = SYSTEMS[record], SYSTEMS[record].train
     actions, output = system.column(system.action), system.column(system.output)
     given: dict[str, Any] = {"num_functions": experiment.num_functions}
@@ -111,7 +111,7 @@ def _followed(experiment: Freeruns, record: str, learner: str, seed: int) -> Fre
 
 
 def _last(record: str, known: SmoothedRecords, earlier: int) -> Tensor:
-    """The last smoothed state with earlier actions, ``1 x state_dim``."""
+    """Return the last smoothed state with earlier actions, ``1 x state_dim``."""
     system = SYSTEMS[record]
     actions = system.column(system.action)
     state = known.records.records[0].states[-1, : len(system.states)]
@@ -120,7 +120,7 @@ def _last(record: str, known: SmoothedRecords, earlier: int) -> Tensor:
 
 
 def tables(runs: Sequence[Run], experiment: Freeruns) -> dict[str, Table]:
-    """Errors, and what intervals hold, of each learner."""
+    """Return errors and coverage of each learner."""
     found, labels = frame(runs), experiment.axes["record"]
     names = experiment.axes["learner"]
 
@@ -145,7 +145,7 @@ def tables(runs: Sequence[Run], experiment: Freeruns) -> dict[str, Table]:
 
 
 def _trivial(name: str) -> str:
-    """The error of the mean of the first part."""
+    """Return the error of the mean of the first part."""
     output, train = SYSTEMS[name].column(SYSTEMS[name].output), SYSTEMS[name].train
     return number(float((output[train:] - output[:train].mean()).square().mean().sqrt()), ".3f")
 

@@ -38,18 +38,18 @@ class System(NamedTuple):
     earlier: int = 0  # how many earlier actions a GP beside f_p reads
 
     def physics(self, values: list[float] | None = None) -> FunctionPhysics:
-        """The next states, with unknown parameters or these."""
+        """Return the next states, with unknown parameters or these."""
         return law_of(self.following, self.unknowns, values)
 
     def spec(self, earlier: int = 0) -> StateSpec:
-        """States and actions, with so many earlier actions, or as many as f_p reads."""
+        """Return states and actions, with so many earlier actions, or as many as f_p reads."""
         lags = _previous("u", max(earlier, self.delay))
         last = f"u_{self.delay}" if self.delay else "u"
         names = [*self.states, *lags]
         return StateSpec(names, ["u"], previous=lags, physics_reads=[*self.states, last])
 
     def column(self, name: str) -> Tensor:
-        """A column of the record."""
+        """Return a column of the record."""
         return torch.from_numpy(pd.read_csv(DATA / self.file)[name].to_numpy(float, copy=True))
 
 
@@ -58,13 +58,13 @@ def _previous(name: str, lags: int) -> dict[str, str]:
 
 
 def narx_spec(outputs: int, actions: int) -> StateSpec:
-    """The output with so many values of output and action, the newest included."""
+    """Return the output with so many values of output and action, the newest included."""
     previous = {**_previous("y", outputs - 1), **_previous("u", actions - 1)}
     return StateSpec(["y", *previous], ["u"], previous=previous)
 
 
 def records(states: Tensor, actions: Tensor, spec: StateSpec) -> Records:
-    """A record whose first states are these; the rest is hidden, or filled in."""
+    """Return a record whose first states are these; the rest is hidden, or filled in."""
     whole = torch.full((len(states), spec.state_dim), torch.nan, dtype=torch.float64)
     whole[:, : states.shape[1]] = states
     times = torch.arange(len(states), dtype=torch.float64)
@@ -72,7 +72,7 @@ def records(states: Tensor, actions: Tensor, spec: StateSpec) -> Records:
 
 
 def _loop(X: Tensor, p: ParameterValues) -> Tensor:
-    """A ball that a controller holds: the angle is against its place, u = -gain y, of late."""
+    """Return the rates of a ball that a controller holds: u = -gain y, of a delayed place."""
     y, v, u = X.unbind(-1)
     pull = p.frequency**2 * (-u / p.gain - y) - 2 * p.damping * p.frequency * v
     faster = v + 0.1 * pull
@@ -80,7 +80,7 @@ def _loop(X: Tensor, p: ParameterValues) -> Tensor:
 
 
 def _two_lags(X: Tensor, p: ParameterValues) -> Tensor:
-    """Two mixed vessels, one after the other."""
+    """Return the rates of two mixed vessels, one after the other."""
     y, mixed, u = X.unbind(-1)
     first, second = (1 - torch.exp(-1 / lag) for lag in (p.lag, p.lag_before))
     return torch.stack(
@@ -89,7 +89,7 @@ def _two_lags(X: Tensor, p: ParameterValues) -> Tensor:
 
 
 def _belt(X: Tensor, p: ParameterValues) -> Tensor:
-    """A pulley on an elastic belt behind motors that lag; the sensor has no sign."""
+    """Return the rates of a pulley on an elastic belt behind motors that lag."""
     _, speed, rate, motor, u = X.unbind(-1)
     for _ in range(4):
         motor = motor + 0.25 * (u - motor) / p.lag
@@ -100,7 +100,7 @@ def _belt(X: Tensor, p: ParameterValues) -> Tensor:
 
 
 def _tanks(X: Tensor, p: ParameterValues) -> Tensor:
-    """Torricelli's outflows of two equal tanks; the pump's flow is a power of its voltage."""
+    """Return Torricelli's outflows of two equal tanks; pumped is a power of the voltage."""
     lower, upper, u = X.unbind(-1)
     inflow = p.pump * u.clamp_min(1e-3) ** p.power
     for _ in range(2):

@@ -46,7 +46,7 @@ _INPUTS = ["Z", "N", "odd Z", "odd N", "near N = Z"]
 
 
 def drop(X: Tensor, p: ParameterValues) -> Tensor:
-    """Binding energy in MeV by Bethe and Weizsaecker, as textbooks of nuclear physics have it."""
+    """Return the binding energy in MeV by Bethe and Weizsaecker, as textbooks have it."""
     Z, N = X[:, 0], X[:, 1]
     A, both = Z + N, 1 - Z % 2 - N % 2  # 1 if both are even, -1 if both are odd
     bulk = p.volume * A - p.surface * A ** (2 / 3)
@@ -55,7 +55,7 @@ def drop(X: Tensor, p: ParameterValues) -> Tensor:
 
 
 def shell(X: Tensor, p: ParameterValues) -> Tensor:
-    """The drop, and the valence nucleons or holes (Dieperink and Van Isacker 2009).
+    """Return the drop, and the valence nucleons or holes (Dieperink and Van Isacker 2009).
 
     A term in their number, as in their equation, and one in the P-factor (Casten et al. 1987).
     """
@@ -76,7 +76,7 @@ _SHELL = {**_DROP, "valence": Unknown(0.0, sd=1.0), "promiscuity": Unknown(0.0, 
 
 
 def nuclides(stride: int = 1) -> pd.DataFrame:
-    """Measured nuclides with Z and N of at least 8, of every how many-th Z; in MeV."""
+    """Return measured nuclides with Z and N of at least 8, of every how many-th Z; in MeV."""
     table = pd.read_csv(DATA)
     table = table[table.Z % stride == 0].reset_index(drop=True)
     table["odd Z"], table["odd N"] = table.Z % 2, table.N % 2
@@ -88,7 +88,7 @@ def nuclides(stride: int = 1) -> pd.DataFrame:
 
 
 def left_out(table: pd.DataFrame, task: str, split: int, seed: int) -> np.ndarray:
-    """Which of the measured nuclides a task leaves out."""
+    """Return which of the measured nuclides a task leaves out."""
     if task == "fold":
         order = np.random.default_rng(split).permutation(len(table))
         return np.asarray(order % 10 == seed % 10)
@@ -98,7 +98,7 @@ def left_out(table: pd.DataFrame, task: str, split: int, seed: int) -> np.ndarra
 
 
 def build(model: str, data: Sequence[Tensor], physics: FunctionPhysics) -> Any:
-    """A model of inputs, energies and variances; shells close with kinks."""
+    """Return a model of inputs, energies and variances; shells close with kinks."""
     matern = Stationary(MATERN52)
     kernels = {"covar_module": matern}
     if model == "cka":
@@ -176,7 +176,7 @@ def _tensors(table: pd.DataFrame) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _trees(train: pd.DataFrame, residual: Tensor, test: pd.DataFrame) -> Tensor:
-    """Gradient boosting of what the fitted drop lacks, by scikit-learn."""
+    """Return gradient boosting, by scikit-learn, of the residual of the fitted drop."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
     trees = HistGradientBoostingRegressor(max_iter=1000, random_state=0)
@@ -185,7 +185,7 @@ def _trees(train: pd.DataFrame, residual: Tensor, test: pd.DataFrame) -> Tensor:
 
 
 def tables(runs: Sequence[Run], experiment: Masses) -> dict[str, Table]:
-    """Errors, coverage and half widths of each task, and the parameters."""
+    """Return errors, coverage and half widths of each task, and the parameters."""
     axes = experiment.axes
     parts = groups(
         frame(runs), ["physics", "model"], lambda f, m: f"{axes['physics'][f]}, {axes['model'][m]}"
@@ -212,7 +212,7 @@ def tables(runs: Sequence[Run], experiment: Masses) -> dict[str, Table]:
 
 
 def _pooled(task: str, score: str, form: str) -> Cell:
-    """A score over the nuclides of all runs of a task; of mean squares the root."""
+    """Return a score over the nuclides of all runs of a task; of mean squares the root."""
 
     def cell(part: pd.DataFrame) -> str:
         own = part_of(part, task=task)

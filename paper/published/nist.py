@@ -111,7 +111,7 @@ def run(experiment: Nist, name: str, start: int, seed: int) -> Run:
 
 
 def tables(runs: Sequence[Run], experiment: Nist) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     columns: dict[str, Cell] = {
         "rows": of("rows", "max", ".0f"),
         "parameters": of("parameters", "max", ".0f"),
@@ -137,7 +137,7 @@ def _both_hold(part: pd.DataFrame) -> bool:
 
 
 def load(runs: Sequence[Run]) -> pd.DataFrame:
-    """The farthest value of each run and its narrowest and widest interval, in standard errors."""
+    """Return the farthest value of each run and its extreme intervals, in standard errors."""
     rows = []
     for run in runs:
         data = reference(run["name"])

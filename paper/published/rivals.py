@@ -41,7 +41,7 @@ def fitted_formula(X: Tensor, Y: Tensor, physics: Physics) -> CalibratedPhysics:
 
 
 def single_task(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
-    """BoTorch's Gaussian process by its defaults, without the formula."""
+    """Fit BoTorch's Gaussian process by its defaults, without the formula."""
     torch.manual_seed(seed)
     d = X.shape[-1]
     model = SingleTaskGP(X, Y, input_transform=Normalize(d), outcome_transform=Standardize(1))
@@ -50,14 +50,14 @@ def single_task(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict
 
 
 def single_task_feature(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
-    """The same with the fitted formula as one more input."""
+    """Fit the same with the fitted formula as one more input."""
     add = _with_feature(X, Y, physics)
     predict = single_task(add(X), Y, physics, seed=seed)
     return lambda test: predict(add(test))
 
 
 def boosting(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
-    """Boosted trees with the fitted formula as one more input.
+    """Fit boosted trees with the fitted formula as one more input.
 
     Number and depth of the trees are those of the least error in five folds of the training rows,
     whose root mean square is the standard deviation.
@@ -88,7 +88,7 @@ def boosting(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
 
 
 def ensemble(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
-    """A deep ensemble on what the fitted formula leaves.
+    """Fit a deep ensemble to the residual of the fitted formula.
 
     Five networks of two layers of 50, each of a mean and a variance, trained by the likelihood from
     weights of their own (Lakshminarayanan et al. 2017), and the moments of their mixture.
@@ -142,7 +142,7 @@ def smt(low_X: Tensor, low_Y: Tensor, X: Tensor, Y: Tensor) -> Predict:
 
 
 def mfk(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
-    """SMT's MFK by its defaults, with the fitted formula as the low level.
+    """Fit SMT's MFK by its defaults, with the fitted formula as the low level.
 
     It is evaluated at the observed inputs and as many more, whose columns are those of observed
     rows in an order of their own.
@@ -165,7 +165,7 @@ RIVALS: dict[str, Callable[..., Predict]] = {
 
 
 def ours(learner: str, **options: Any) -> Callable[..., Predict]:
-    """What fits one of our learners by the default; its predictions are of observations."""
+    """Return a call that fits one of our learners by the default; it predicts observations."""
 
     def fitted(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
         model = LEARNERS[learner].make(X, Y, physics=physics, **options)

@@ -28,7 +28,7 @@ TRACE = 0.001  # a mole fraction below which an element is a trace
 
 
 def strength(X: Tensor, p: ParameterValues) -> Tensor:
-    """Yield strength in MPa.
+    """Return the yield strength in MPa.
 
     Lath martensite, a linear solid solution, carbon and nitrogen by the root of their share (more
     with what forms carbides), and particles of Ni3(Ti, Mo, Al) by the root of theirs; cobalt takes
@@ -76,7 +76,7 @@ KERNELS = {
 
 
 def split(fold: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Inputs and outputs in MPa of the training rows of a fold, and of its test rows."""
+    """Return inputs and outputs in MPa of the training rows of a fold, and of its test rows."""
     rows = pd.read_csv(DATA)
     out = torch.tensor((rows["test_fold"] == fold).tolist())
     X, Y = (
@@ -95,7 +95,7 @@ def run(experiment: Steels, method: str, seed: int) -> Run:
 
 
 def tables(runs: Sequence[Run], experiment: Steels) -> dict[str, Table]:
-    """Mean absolute errors over the folds, beside published ones."""
+    """Return mean absolute errors over the folds, beside published ones."""
     columns: dict[str, Cell] = {
         "mean absolute error, MPa": mean_error("mae", ".1f"),
         "folds": len,

@@ -29,7 +29,7 @@ def run(experiment: Uci, name: str, share: float, method: str, seed: int) -> Run
 
 
 def tables(runs: Sequence[Run], experiment: Uci) -> dict[str, Table]:
-    """All tables, by name."""
+    """Return all tables, by name."""
     found = frame(runs)
     methods = groups(found, "method", experiment.axes["method"])
     cells = {

@@ -24,7 +24,7 @@ _OUTPUTS = {"yacht": "residuary_resistance", "energy": "heating_load", "concrete
 
 
 def resistance(X: Tensor, p: ParameterValues) -> Tensor:
-    """Wave resistance of a yacht by its Froude number.
+    """Return the wave resistance of a yacht by its Froude number.
 
     The exponential of Holtrop and Mennen (1982, An approximate power prediction method,
     International Shipbuilding Progress 29), without the term of interference and with one pair of
@@ -35,7 +35,7 @@ def resistance(X: Tensor, p: ParameterValues) -> Tensor:
 
 
 def heating(X: Tensor, p: ParameterValues) -> Tensor:
-    """Heat that a building loses, U A times one difference of temperature.
+    """Return the heat that a building loses, U A times one difference of temperature.
 
     Through walls, glass and roof, and by the air of its floors. A floor is as large as the roof and
     3.5 m high, and glazing is a share of the floors (the description of the data).
@@ -47,7 +47,7 @@ def heating(X: Tensor, p: ParameterValues) -> Tensor:
 
 
 def strength(X: Tensor, p: ParameterValues) -> Tensor:
-    """Compressive strength of concrete by its water and its age.
+    """Return the compressive strength of concrete by its water and its age.
 
     Abrams's law (1918), a b^-(water / binder), in which slag and ash count for a share of cement
     (the k-values of EN 206), and growth with the logarithm of the age in units of 28 days.

@@ -148,7 +148,7 @@ def _write_of_joint(spec: Any, joint: str, field: str, value: float) -> None:
 
 
 def tables(runs: Sequence[Run], experiment: Simulators) -> dict[str, Table]:
-    """A table of each machine and friction: a row for each method and parameter."""
+    """Return a table of each machine and friction: a row for each method and parameter."""
     found = load(runs)
     header = ["", "parameter", "logs", "95 % interval holds", "median half width [%]"]
     header += ["median error [%]", "free run: median RMSE [rad]", "by the guesses", "CPU [s]"]
@@ -164,7 +164,7 @@ def tables(runs: Sequence[Run], experiment: Simulators) -> dict[str, Table]:
 
 
 def load(runs: Sequence[Run]) -> pd.DataFrame:
-    """A row for each parameter of each log and method."""
+    """Return a row for each parameter of each log and method."""
     rows = []
     for each in runs:
         keys = ("machine", "friction", "method", "free_run", "free_run_guesses", "seconds")

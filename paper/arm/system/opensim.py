@@ -38,7 +38,7 @@ class Muscle:
     path: tuple[float, float, float, float]  # a, s, e_1 and e_2
 
     def length(self, shoulder: float, elbow: float) -> float:
-        """The length of the path, in m, at angles in rad."""
+        """Return the length of the path, in m, at angles in rad."""
         a, s, e_1, e_2 = self.path
         return a + s * (shoulder - math.pi / 2) + e_1 * elbow + e_2 * elbow**2
 
@@ -60,7 +60,7 @@ NUM_EXCITED = 4
 
 @lru_cache(maxsize=1)
 def load_opensim() -> ModuleType:
-    """OpenSim, silenced: else it prints, and writes ``opensim.log`` to the working directory.
+    """Load OpenSim and silence it: else it prints, and writes ``opensim.log``.
 
     The first call switches the logger off, which is the process's own; later ones leave it alone,
     so that ``opensim.Logger.setLevelString("info")`` after the first arm was built lets it speak.
@@ -86,7 +86,7 @@ def load_opensim() -> ModuleType:
 
 
 def build_muscle_arm(equation: ArmEquation, strength: float) -> Any:
-    """The links of an equation with six muscles, of which four are excited.
+    """Build the links of an equation with six muscles, of which four are excited.
 
     The state of this ``opensim.Model`` is angles, velocities and six activations; its inputs are
     the excitations. The strength is a factor on the forces of the muscles.
@@ -152,7 +152,7 @@ def _muscle(opensim: ModuleType, muscle: Muscle, strength: float) -> Any:
 
 
 def _path(opensim: ModuleType, muscle: Muscle) -> Any:
-    """A path as a polynomial: wrapping surfaces flip sides at large angles."""
+    """Return a path as a polynomial: wrapping surfaces flip sides at large angles."""
     a, s, e_1, e_2 = muscle.path
     coefficients = opensim.Vector(6, 0.0)
     # of 1, e, e^2, s, s e, s^2
@@ -195,7 +195,7 @@ class ArmSimulation:
         self._start_anew()
 
     def step(self, state: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The state after 0.2 s.
+        """Return the state after 0.2 s.
 
         Args:
             state: Angles and velocities, then the six activations if there are muscles.

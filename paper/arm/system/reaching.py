@@ -46,12 +46,12 @@ Muscles follow their excitations with a delay, so that the next state depends on
 
 
 def angle_error(states: Tensor) -> Tensor:
-    """The root mean square error of the angles, ``...`` in rad, of states ``... x 6`` or more."""
+    """Return the angles' root mean square error, ``...`` in rad, of states ``... x 6`` or more."""
     return (states[..., :2] - states[..., 4:6]).square().mean(-1).sqrt()
 
 
 def arm_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-    r"""The reward of transitions, of the next states alone: minus the error of the angles, in rad.
+    r"""Return the reward of transitions, minus the error of the next states' angles in rad.
 
     .. math:: r = -\sqrt{\big((\theta_s - \theta_s^*)^2 + (\theta_e - \theta_e^*)^2\big) / 2}
     """
@@ -72,13 +72,13 @@ def arm_start(n: int, spec: StateSpec = ARM_SPEC) -> Tensor:
 
 
 def arm_targets() -> Tensor:
-    """The ``121 x 2`` targets, in rad, at which policies are compared: 0, 10, ..., 100° each."""
+    """Return the ``121 x 2`` targets, in rad, of the evaluation: 0, 10, ..., 100° each."""
     grid = torch.arange(0, 101, 10, dtype=torch.float64).deg2rad()
     return torch.cartesian_prod(grid, grid)
 
 
 def hand_position(angles: Tensor) -> Tensor:
-    """The position of the hand, ``... x 2`` in m, seen from the shoulder, by its two angles in rad.
+    """Return the position of the hand, ``... x 2`` in m, from the shoulder, by angles in rad.
 
     Example:
         >>> hand_position(torch.tensor([0.0, torch.pi / 2], dtype=torch.float64))
@@ -91,7 +91,7 @@ def hand_position(angles: Tensor) -> Tensor:
 
 
 def hand_distance_cm(states: Tensor) -> Tensor:
-    """The distance ``...`` of the hand from its place at the target angles, in cm, of states.
+    """Return the distance ``...`` of the hand from its place at the target angles, in cm.
 
     Example:
         >>> hand_distance_cm(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi]))
@@ -102,7 +102,7 @@ def hand_distance_cm(states: Tensor) -> Tensor:
 
 
 def arm(*, strength: float = 0.5, memory: bool = False, episode_length: int = 15) -> System:
-    """Reaching with an arm of six muscles; its physics has torques in their place.
+    """Return the arm of six muscles that reaches; its physics has torques in their place.
 
     Its environment is :class:`MuscleArmEnv`. In the physics, which Runge-Kutta of order four
     integrates, the links are a tenth too heavy, the joints damped twice as much as the real ones;
@@ -136,6 +136,6 @@ def arm(*, strength: float = 0.5, memory: bool = False, episode_length: int = 15
 
 
 def _make(memory: bool, **options: Any) -> gym.Env[Any, Any]:
-    """The environment."""
+    """Return the environment."""
     env = gym.make("MuscleArm-v0", **options)
     return RememberAction(env) if memory else env

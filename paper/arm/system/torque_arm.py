@@ -54,7 +54,7 @@ class ArmEquation:
     gains: tuple[float, float] = (0.0, 0.0)
 
     def __call__(self, state: Tensor, action: Tensor) -> Tensor:
-        """The time derivative ``... x 4`` of the state.
+        """Return the time derivative ``... x 4`` of the state.
 
         Args:
             state: ``... x 4``: angles and angular velocities of shoulder and elbow, in rad and s.

@@ -38,7 +38,7 @@ class Link(NamedTuple):
     direction: complex
 
     def place(self, along: complex) -> complex:
-        """A place along the link, and to its side."""
+        """Return a place along the link, and to its side."""
         return self.joint + along * self.direction
 
 
