@@ -153,7 +153,7 @@ def _map(maps: pd.DataFrame, curves: Curves) -> Finding:
     numbers = [f"{low[name].sum() or 'none'}" for name in ("cka", "mf")]
     measured = (
         f"at most {LOW:g} cm at {numbers[0]} of 121 targets by CKA, at {numbers[1]} by model-free, "
-        f"which errs by {near.mean():.1f} cm at those within {NEAR:g} cm of the start, by "
+        f"whose error is {near.mean():.1f} cm at those within {NEAR:g} cm of the start, "
         f"{away.mean():.1f} beyond {FAR:g}"
     )
     where = reproduced(bool(low["cka"].mean() >= 0.9 and low["mf"].mean() < 0.5))
@@ -201,7 +201,7 @@ def _intervals(episodes: pd.DataFrame, curves: Curves) -> Finding:
     away = (coverage - 0.95).abs()
     found = [within(Difference.of(away[name] - away["gp"]), high=0) for name in ("cka", "rra")]
     said = ", ".join(f"{SCENARIOS[n].label} {coverage[n].mean():.2f}" for n in ("cka", "rra", "gp"))
-    return all_of(*found), f"95 % hold {said}"
+    return all_of(*found), f"coverage of 95 % intervals: {said}"
 
 
 def claims(episodes: pd.DataFrame, maps: pd.DataFrame) -> tuple[Claim, ...]:

@@ -120,7 +120,7 @@ class Control(Experiment):
         if self.known[name].kind == "none":
             return settings
         task = self.setup(name, 0).task.describe()
-        task.pop("dynamics.model_options", None)  # told beside the task
+        task.pop("dynamics.model_options", None)  # recorded in addition to the task
         return {**settings, "task": task, "options": dict(self.known[name].options)}
 
     def run(self, *case: Any) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def curves(
         path: The file.
         parts: Runs by the title of their panel: a row for each run and ``episode``, ``value``.
         lines: Label and color of the learners that are drawn.
-        labels: What stands below and beside all panels.
+        labels: Labels below and at the left of all panels.
         finish: Adds to a panel.
     """
     figure, axes = panels([*parts], 2, (4.2, 3.0), width=8.0)

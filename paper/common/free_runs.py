@@ -1,4 +1,4 @@
-"""Free runs of physics and of models beside it."""
+"""Free runs of a physics and of models that adjust it."""
 
 from __future__ import annotations
 

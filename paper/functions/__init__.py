@@ -31,7 +31,7 @@ PROBLEMS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Functions(Experiment):
-    """Is CKA worse than its formula, or than simpler models, and do its intervals hold?"""
+    """Is CKA worse than its formula, or than simpler models, and do its intervals cover 95 %?"""
 
     runs: int = 10  # data sets of each cell
     seed: int = 300

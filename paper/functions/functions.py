@@ -67,7 +67,7 @@ def data_of(name: str, n: int, num_test: int, seed: int) -> Data:
 
 
 def run(experiment: Functions, problem: str, n: int, learner: str, seed: int) -> Run:
-    """Fit a learner to a data set; return its error, its density and what its intervals hold."""
+    """Fit a learner to a data set; return its error, its density and its coverage."""
     data = data_of(problem, n, experiment.num_test, seed)
     sd, begin = data.truth.std(), time.perf_counter()
     if learner == "formula" and problem not in LAWS:
@@ -113,7 +113,7 @@ def tables(runs: Sequence[Run], experiment: Functions) -> dict[str, Table]:
         f"{label}: {what}": of(column, how, form, learner=name)
         for column, what, how, form in (
             ("error", "median error / sd", "median", ".2g"),
-            ("coverage", "95 % hold", "mean", ".3f"),
+            ("coverage", "95 % coverage", "mean", ".3f"),
             ("nlpd", "median NLPD", "median", ".2f"),
             ("seconds", "s", "median", ".1f"),
         )
@@ -134,12 +134,16 @@ def tables(runs: Sequence[Run], experiment: Functions) -> dict[str, Table]:
         for name in ("formula", "phymean", "gp")
     }
     single["error / sd"] = of("error", "median", ".2g", learner="cka")
-    single["95 % hold"] = of("coverage", "mean", ".2f", learner="cka")
+    single["95 % coverage"] = of("coverage", "mean", ".2f", learner="cka")
     cells = groups(found, _CELL, "{}, {}".format)
     return {
-        "formula": Table("CKA beside its formula, fitted", table(parts, worse, "the formula is")),
+        "formula": Table(
+            "CKA compared with its fitted formula", table(parts, worse, "the formula is")
+        ),
         "learners": Table("All learners", table(parts, each, "the formula is")),
-        "rho": Table("CKA beside delta alone, and a GP", table(parts, rho, "the formula is")),
+        "rho": Table(
+            "CKA compared with delta alone, and a GP", table(parts, rho, "the formula is")
+        ),
         "cells": Table(
             "Each cell: geometric means of ratios, median error", table(cells, single, "problem, n")
         ),

@@ -11,7 +11,7 @@ from paper.common.experiment import Axes, Experiment
 
 @dataclass(frozen=True, kw_only=True)
 class Kinds(Experiment):
-    """Each kind of data: the option that is for it beside plain CKA."""
+    """Each kind of data: its option compared with plain CKA."""
 
     axes: ClassVar[Axes] = {
         "kind": {

@@ -330,8 +330,8 @@ def tables(runs: Sequence[Run], experiment: Kinds) -> dict[str, Table]:
         "median error, option": of("error", "median", ".2g", learner="option"),
         "error, option / plain": ratio_of("error", "option", "plain"),
         "option better": _better,
-        "95 % hold, plain": of("coverage", "mean", ".2f", learner="plain"),
-        "95 % hold, option": of("coverage", "mean", ".2f", learner="option"),
+        "95 % coverage, plain": of("coverage", "mean", ".2f", learner="plain"),
+        "95 % coverage, option": of("coverage", "mean", ".2f", learner="option"),
         "seconds, plain": of("seconds", "median", ".1f", learner="plain"),
         "seconds, option": of("seconds", "median", ".1f", learner="option"),
     }

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from paper.common.experiment import Axes, Experiment
 
 HORIZONS = (10, 20, 40)
-"""Steps of 0.05 s after which free runs are scored, of ``real`` beside the single steps."""
+"""Steps of 0.05 s after which ``real`` scores free runs, in addition to single steps."""
 
 _DYNAMICS = ("gpadjust.dynamics.LearnedDynamics", "gpadjust.dynamics.Dynamics.free_run")
 

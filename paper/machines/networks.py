@@ -1,4 +1,4 @@
-"""Networks as dynamics, beside f_p."""
+"""Networks that adjust f_p, as dynamics."""
 
 from __future__ import annotations
 

@@ -147,7 +147,9 @@ def load(runs: Sequence[Run]) -> pd.DataFrame:
 def tables(runs: Sequence[Run], experiment: Real) -> dict[str, Table]:
     """Return all tables, by name."""
     scored, axes = load(runs), experiment.axes
-    found = {"paired": Table("n = 100, beside least squares by the same draws", _paired(scored))}
+    found = {
+        "paired": Table("n = 100, divided by least squares of the same draws", _paired(scored))
+    }
     for (name, test), own in scored.groupby(["system", "test"], sort=False):
         for score, forms in SCORES.items():
             for steps in (1, *HORIZONS):

@@ -87,7 +87,7 @@ def tables(runs: Sequence[Run], experiment: Tanks) -> dict[str, Table]:
         "RMSE, V": mean_error("rmse", ".3f"),
         "worst run, V": of("rmse", "max", ".3f"),
         "runs": len,
-        "95 % hold": of("coverage", "mean", ".2f"),
+        "95 % coverage": of("coverage", "mean", ".2f"),
         "width of 95 %, V": of("width", "mean", ".2f"),
         "seconds": of("seconds", "median", ".0f"),
     }

@@ -1,4 +1,4 @@
-"""Unknown parameters of a physics: do their intervals hold what they are about?"""
+"""Unknown parameters of a physics: do their intervals cover the true values?"""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Parameters(Experiment):
 
 @dataclass(frozen=True, kw_only=True)
 class Nuts(Experiment):
-    """The default fit beside NUTS and the most likely numbers, of the same density."""
+    """The default fit compared with NUTS and the most likely numbers, of the same density."""
 
     runs: int = 2  # seeds of each fit
     num_draws: int = 640  # of NUTS, in four chains, after half as many that are not kept

@@ -97,7 +97,7 @@ def tables(runs: Sequence[Run], experiment: Nuts) -> dict[str, Table]:
 
 
 def _beside(runs: Sequence[Run], method: str) -> list[str]:
-    """Return the cells of a method; of NUTS those of its second seed beside its first."""
+    """Return the cells of a method; of NUTS, its second seed compared with its first."""
     by_nuts = [run for run in runs if run["method"] == "nuts"]
     reference = min(by_nuts, key=lambda run: run["seed"], default={})
     own = [run for run in runs if run["method"] == method]

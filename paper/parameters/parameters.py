@@ -1,4 +1,4 @@
-"""How often intervals of parameters hold what is best and what is true, and how wide they are."""
+"""How often intervals of parameters cover the best and the true value, and how wide they are."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from paper.parameters.laws import case, textbook_case
 
 
 def run(experiment: Parameters, problem: str, model: str, seed: int) -> Run:
-    """Fit a model to a case; return ends of intervals, beside what they are to hold."""
+    """Fit a model to a case; return ends of intervals, and the values that they should cover."""
     known = textbook_case(problem, seed) if problem in TEXTBOOK else case(problem, seed)
     made = LEARNERS[model].make(known.X, known.Y, physics=known.physics)
     seconds = fitted(made)
@@ -38,8 +38,8 @@ def tables(runs: Sequence[Run], experiment: Parameters) -> dict[str, Table]:
     found, axes = load(runs), experiment.axes
     columns: dict[str, Cell] = {
         "cases": len,
-        "holds the best": of("best", "mean", ".2f"),
-        "holds the true": of("true", "mean", ".2f"),
+        "covers the best": of("best", "mean", ".2f"),
+        "covers the true": of("true", "mean", ".2f"),
         "median width": of("width", "median"),
         "RMSE": of("rmse", "median"),
         "coverage": of("coverage", "mean", ".2f"),

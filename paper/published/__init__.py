@@ -167,7 +167,7 @@ class Freeruns(Experiment):
 
 @dataclass(frozen=True, kw_only=True)
 class Masses(Experiment):
-    """Binding energies of nuclides: a liquid drop and what it lacks."""
+    """Binding energies of nuclides: a liquid drop and its residual."""
 
     runs: int = 3  # folds of ten that are left out
     split: int = 0  # seed of the ten folds

@@ -147,7 +147,7 @@ def tables(runs: Sequence[Run], experiment: Emps) -> dict[str, Table]:
         "RMSE, mm": mean_error("rmse", ".2f"),
         "mean path of all runs, RMSE, mm": _pooled,
         "worst run, mm": of("rmse", "max", ".2f"),
-        "95 % hold": mean_error("coverage", ".2f"),
+        "95 % coverage": mean_error("coverage", ".2f"),
         "half width of 95 %, mm": mean_error("half_width", ".1f"),
         "seconds": of("seconds", "mean", ".0f"),
     }

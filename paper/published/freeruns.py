@@ -135,7 +135,7 @@ def tables(runs: Sequence[Run], experiment: Freeruns) -> dict[str, Table]:
         more.append([f"{method}, published", *(known.get(name, "") for name in there)])
     columns = across(found, "record", labels, rmse)
     text = table(groups(found, "learner", names), columns, "RMSE", more)
-    shown = {"95 % hold": of("coverage", "mean", ".2f"), "half width of 95 %": of("half_width")}
+    shown = {"95 % coverage": of("coverage", "mean", ".2f"), "half width of 95 %": of("half_width")}
     shown |= {"seconds": of("seconds", "mean", ".0f"), "runs": len}
     each = groups(found, ["record", "learner"], lambda r, name: f"{labels[r]}, {names[name]}")
     return {

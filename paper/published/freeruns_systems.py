@@ -35,7 +35,7 @@ class System(NamedTuple):
     noise: tuple[float, ...] | None  # process noise; None if it is learnt
     narx: tuple[int, int]  # how many outputs and actions a GP without f_p reads
     delay: int = 0  # steps by which the action is late
-    earlier: int = 0  # how many earlier actions a GP beside f_p reads
+    earlier: int = 0  # how many earlier actions a GP that adjusts f_p reads
 
     def physics(self, values: list[float] | None = None) -> FunctionPhysics:
         """Return the next states, with unknown parameters or these."""

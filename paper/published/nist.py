@@ -1,4 +1,4 @@
-"""NIST's reference data of nonlinear regression: certified values beside draws of the posterior.
+"""NIST's reference data of nonlinear regression: certified values, and draws of the posterior.
 
 Each parameter is one of NIST's two starts times an unknown factor, which is log-normal around 1 by
 a factor of 10: the same rule for all sets, fixed before the first run.
@@ -118,11 +118,11 @@ def tables(runs: Sequence[Run], experiment: Nist) -> dict[str, Table]:
         "farthest value, start 1": of("off", "max", ".2g", start=1),
         "farthest value, start 2": of("off", "max", ".2g", start=2),
         "widths": lambda part: f"{part['least'].min():.2g} to {part['most'].max():.2g}",
-        "both hold": lambda part: "yes" if _both_hold(part) else "no",
+        "within both": lambda part: "yes" if _within_both(part) else "no",
         "seconds": of("seconds", "mean", ".1f"),
     }
     parts = groups(load(runs), "name", experiment.axes["name"])
-    good = sum(map(_both_hold, parts.values()))
+    good = sum(map(_within_both, parts.values()))
     summary = [["sets", f"{len(parts)}"], ["within both limits", f"{good}"]]
     title = "Distance from the certified values and widths, in standard errors"
     return {
@@ -131,7 +131,7 @@ def tables(runs: Sequence[Run], experiment: Nist) -> dict[str, Table]:
     }
 
 
-def _both_hold(part: pd.DataFrame) -> bool:
+def _within_both(part: pd.DataFrame) -> bool:
     widths = part["least"].min() > 1 / WIDE and part["most"].max() < WIDE
     return bool(part["off"].max() < 1 and widths)
 

@@ -1,4 +1,4 @@
-"""Other people's models with a formula beside their inputs, and how they and ours are judged."""
+"""Other people's models with a formula as one more input, and scores of theirs and ours."""
 
 from __future__ import annotations
 

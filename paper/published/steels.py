@@ -95,13 +95,13 @@ def run(experiment: Steels, method: str, seed: int) -> Run:
 
 
 def tables(runs: Sequence[Run], experiment: Steels) -> dict[str, Table]:
-    """Return mean absolute errors over the folds, beside published ones."""
+    """Return mean absolute errors over the folds, and published ones."""
     columns: dict[str, Cell] = {
         "mean absolute error, MPa": mean_error("mae", ".1f"),
         "folds": len,
         "worst fold, MPa": of("mae", "max", ".1f"),
         "RMSE, MPa": of("rmse", "mean", ".1f"),
-        "95 % hold": of("coverage", "mean", ".3f"),
+        "95 % coverage": of("coverage", "mean", ".3f"),
         "seconds of a fit": of("seconds", "median", ".0f"),
     }
     rows = groups(frame(runs), "method", experiment.axes["method"])

@@ -1,4 +1,4 @@
-"""Yacht, energy and concrete: errors and densities beside published ones, on the same splits.
+"""Yacht, energy and concrete: errors and densities, and published ones on the same splits.
 
 Published numbers are test errors and log likelihoods over twenty splits of nine tenths of the rows.
 Splits, scores and methods were fixed before the first run; formulas and priors were tried on
@@ -52,7 +52,7 @@ def tables(runs: Sequence[Run], experiment: Uci) -> dict[str, Table]:
             "RMSE in that of the GP, geometric mean and 95 % interval over the splits",
             lambda **cell: of_gp(part_of(found, **cell)),
         ),
-        "coverage": ("95 % hold", partial(of, "coverage", "mean", ".2f")),
+        "coverage": ("95 % coverage", partial(of, "coverage", "mean", ".2f")),
         "seconds": ("Seconds of a fit", partial(of, "seconds", "median", ".2g")),
     }
     full = {f"{what}, {name}": mean_error(score, form, counted=True, table=name)
@@ -61,7 +61,7 @@ def tables(runs: Sequence[Run], experiment: Uci) -> dict[str, Table]:
     rows = groups(part_of(found, share=0.9), "method", experiment.axes["method"])
     more = [[label, *cells] for label, cells in published("uci").items()]
     text = table(rows, {**full, "source": lambda part: "this run"}, "method", more)
-    title = "RMSE and log likelihood by nine tenths of the rows, beside published ones"
+    title = "RMSE and log likelihood by nine tenths of the rows, and published ones"
     return {"published": Table(title, text)} | {
         name: Table(
             title,

@@ -1,4 +1,4 @@
-"""Parameters of simulators from logs: intervals, and free runs, beside mujoco.sysid."""
+"""Parameters of simulators from logs: intervals and free runs, compared with mujoco.sysid."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Simulators(Experiment):
         "friction": {"right": "the MJCF is right", "lacking": "the MJCF lacks dry friction"},
         "method": {
             "sysid": "mujoco.sysid",
-            "sysid-told": "mujoco.sysid, told of dry friction",
+            "sysid-told": "mujoco.sysid, with dry friction",
             "identify": "identify",
             "advised": "identify again, with the friction that its advice names",
         },

@@ -1,4 +1,4 @@
-"""How often intervals of a simulator's parameters hold the true ones, and errors of free runs."""
+"""How often intervals of a simulator's parameters cover the true ones, and errors of free runs."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _write_of_joint(spec: Any, joint: str, field: str, value: float) -> None:
 def tables(runs: Sequence[Run], experiment: Simulators) -> dict[str, Table]:
     """Return a table of each machine and friction: a row for each method and parameter."""
     found = load(runs)
-    header = ["", "parameter", "logs", "95 % interval holds", "median half width [%]"]
+    header = ["", "parameter", "logs", "95 % coverage", "median half width [%]"]
     header += ["median error [%]", "free run: median RMSE [rad]", "by the guesses", "CPU [s]"]
     shown = {}
     for machine, title in experiment.axes["machine"].items():
@@ -170,7 +170,7 @@ def load(runs: Sequence[Run]) -> pd.DataFrame:
         keys = ("machine", "friction", "method", "free_run", "free_run_guesses", "seconds")
         for name, true in each["true"].items():
             estimate, low, high = each["estimates"][name]
-            row = {"parameter": name, "holds": float(low <= true <= high)}
+            row = {"parameter": name, "covers": float(low <= true <= high)}
             row |= {"width": 50 * (high - low) / true, "error": 100 * abs(estimate / true - 1)}
             rows.append({**{key: each[key] for key in keys}, **row})
     return pd.DataFrame(rows)
@@ -183,7 +183,7 @@ def _rows(found: pd.DataFrame, experiment: Simulators) -> list[list[str]]:
         for i, (parameter, part) in enumerate(own.groupby("parameter", sort=False)):
             of_parameter = [
                 *(label if i == 0 else "", str(parameter), f"{len(part)}"),
-                number(part["holds"].mean(), ".2f"),
+                number(part["covers"].mean(), ".2f"),
                 number(part["width"].median(), ".2g"),
                 number(part["error"].median(), ".2g"),
             ]
