@@ -21,7 +21,6 @@ SCENARIOS = {
     "gp": scenario("gp"),
     "cka": scenario("cka"),
     "rra": scenario("rra"),
-    "cka-memory": scenario("cka", "Dyna-CKA, memory", memory=True),
 }
 PAPER = ("mf", "phy", "gp", "cka", "rra")  # those that the paper compares
 
@@ -37,7 +36,6 @@ class Arm(Control):
     evaluate_every: int = 3  # episodes between two evaluations; the first is before all
     map_after: int = 9  # episodes after which the errors at each target are kept
     strength: float = 0.5  # of the muscles; a healthy arm's is 1
-    memory: bool = False  # whether policy and model see the previous action
 
     axes: ClassVar[Axes] = {"scenario": {name: each.label for name, each in SCENARIOS.items()}}
     packages: ClassVar[tuple[str, ...]] = (*Control.packages, "opensim")

@@ -14,11 +14,10 @@ from paper.cartpole import Control
 from paper.cartpole.control import foresight, load, trials_table
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves
-from paper.common.tables import claims_table, markdown
+from paper.common.tables import claims_table
 from paper.common.verdicts import Curves, judge
 
 MEASURES = {"all_steps": "all steps", "last_five": "last five steps"}
-WINDOWS = ((3, 9), (24, 30))
 _SHOWN = (3, 6, 9, 12, 18, 24, 30)  # episodes
 
 
@@ -55,30 +54,8 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
             evaluations, measure, experiment.labels, _SHOWN, (24, LAST), (24, LAST), ".1f"
         )
         found[name] = Table(f"Hand's error in cm, {MEASURES[measure]}", text)
-    found["memory"] = Table(
-        "With and without the previous action, cm", _memory(of["all_steps"], experiment)
-    )
     found["model"] = Table("How well models foresaw trials", foresight(episodes, experiment))
     return found
-
-
-def _memory(every: Curves, experiment: Control) -> str:
-    """Return a table of errors with and without the previous action, of the seeds of both."""
-    header, rows = ["", "runs"], []
-    for first, last in WINDOWS:
-        header += [f"{first}-{last} without", "with", "difference"]
-    for name in experiment.known:
-        remembering = f"{name}-memory"
-        if not {name, remembering} <= set(every.names):
-            continue
-        curves = every.restricted(every.seeds(name) & every.seeds(remembering))
-        cells = [experiment.labels[name], f"{len(curves.seeds(name))}"]
-        for window in WINDOWS:
-            cells += [f"{curves.window(n, *window).mean():.1f}" for n in (name, remembering)]
-            gap = curves.paired_difference(remembering, *window, reference=name)
-            cells.append(gap.text(".1f"))
-        rows.append(cells)
-    return markdown(header, rows)
 
 
 BOUND = 4.1  # cm, all steps, of SAC after 1,000 trials

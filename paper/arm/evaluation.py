@@ -26,7 +26,6 @@ def setup(scenario: Scenario, settings: Arm) -> Setup:
     """Return the arm, the task and the recorder of a run."""
     system = arm(
         strength=settings.strength,
-        memory=settings.memory,
         episode_length=settings.episode_length,
     )
     physics: Any = system.physics
@@ -48,12 +47,10 @@ def reach(policy: Any, settings: Arm) -> NDArray[np.float64]:
     targets = arm_targets().numpy()
     rest = [*START_MEAN, 0.0, 0.0, *[REST_ACTIVATION] * len(MUSCLES)]
     arms = np.tile(np.array(rest), (len(targets), 1))
-    actions = np.zeros((len(targets), 4))
     failed = np.zeros(len(targets), dtype=bool)
     distances = []
     for _ in range(settings.episode_length):
-        remembered = [actions] if settings.memory else []
-        seen = np.concatenate([arms[:, :4], targets, *remembered], axis=1)
+        seen = np.concatenate([arms[:, :4], targets], axis=1)
         chosen, _ = policy.predict(seen.astype(np.float32), deterministic=True)
         actions = np.asarray(chosen, dtype=np.float64).clip(0, 1)
         for i in np.flatnonzero(~failed):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -21,19 +21,18 @@ class Scenario(Learner):
 
     # Settings that it has in place of the shared ones.
     changes: Mapping[str, Any] = field(default_factory=dict)
-    max_runs: int | None = None  # the most seeds that it is run with
     # `"learnt"`, or `"physics"` for f_p alone, `"truth"` for the real system, `"none"` for
     # a model-free learner.
     kind: str = "learnt"
 
 
-def scenario(name: str, label: str = "", max_runs: int | None = None, **changes: Any) -> Scenario:
+def scenario(name: str, label: str = "", **changes: Any) -> Scenario:
     """Return a scenario of a learner of the registry."""
     known = LEARNERS[name]
     kind = {"phy": "physics", "oracle": "truth", "mf": "none"}.get(name, "learnt")
     literal = LITERAL if name in ("cka", "rra") else {}
     label = label or f"Dyna-{known.label}"
-    own: dict[str, Any] = {"changes": changes, "max_runs": max_runs, "kind": kind}
+    own: dict[str, Any] = {"changes": changes, "kind": kind}
     return Scenario(label, known.color, known.model, literal, known.adjusts, **own)
 
 
@@ -110,10 +109,6 @@ class Control(Experiment):
         """Return the experiment with the settings of a learner."""
         return self.changed(self.known[name].changes)
 
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """Return the seeds, of some learners few."""
-        return self.seeds[: self.known[kind[0]].max_runs]
-
     def describe(self, *kind: Any) -> dict[str, Any]:
         """Return the settings of the learner, and the task with its dynamics, if it has a model."""
         name, settings = kind[0], self.settings_of(kind[0]).settings
@@ -141,7 +136,6 @@ SCENARIOS = {
     "rra": scenario("rra"),
     "rra-paper": scenario("rra-paper", "Dyna-RRA, paper", target="absolute"),
     "oracle": scenario("oracle", "oracle"),
-    "cka-absolute": scenario("cka", "Dyna-CKA, absolute", 4, target="absolute"),
 }
 
 

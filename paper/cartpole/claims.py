@@ -55,8 +55,7 @@ def _cka(curves: Curves) -> Finding:
     late = _mean(curves, "cka", 41, 50)
     held = first is not None and touch is not None and first <= 7 and touch <= 13 and late <= 0.45
     beaten = held and (first or 0) < 6 and (touch or 0) < 12 and late <= 0.4
-    measured = _described(curves, "cka") + _beside(curves, "cka-absolute")
-    return reproduced(held, beaten), f"in our form, {measured}"
+    return reproduced(held, beaten), f"in our form, {_described(curves, 'cka')}"
 
 
 def _rra(curves: Curves) -> Finding:

@@ -52,12 +52,12 @@ class TestArm:
     @pytest.mark.slow
     @pytest.mark.usefixtures("_few_targets")
     def test_an_evaluation_is_that_of_the_environment(self):
-        settings, policy = replace(TINY_ARM, memory=True), Still()
+        settings, policy = TINY_ARM, Still()
         before = generators()
         distances = reach(policy, settings)
         assert torch.equal(generators()[2], before[2])
         assert distances.shape == (4, 5)
-        env = settings.setup("cka-memory", 0).env
+        env = settings.setup("cka", 0).env
         target = evaluation.arm_targets()[1].tolist()
         start = [*np.radians([35.0, 65.0]), 0.0, 0.0]
         seen, _ = env.reset(seed=0, options={"state": start, "target": target})
