@@ -18,7 +18,7 @@ Y = torch.tensor(energy * (Z + N) / 1000).unsqueeze(-1)  # MeV
 
 
 def drop(X, p):
-    """Return MeV by Bethe and Weizsaecker, of nuclides with even Z and N."""
+    """Return binding energies in MeV by Bethe and Weizsaecker, even Z and N."""
     Z, N = X.unbind(-1)
     A = Z + N
     bulk = p.volume * A - p.surface * A ** (2 / 3)

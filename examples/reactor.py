@@ -13,7 +13,7 @@ from gpadjust import CKA, fit
 
 
 def worth(X, first=60e3, second=75e3):
-    """Return % of B in A -> B -> C, less 0.4 a minute; energies in J/mol."""
+    """Return B's yield in %, A -> B -> C, less 0.4 a minute; energies: J/mol."""
     inverse = (1 / X[:, 0] - 1 / 340) / 8.314  # X: temperature in K, time in min
     k1, k2 = 0.08 * (-first * inverse).exp(), 0.03 * (-second * inverse).exp()
     share = k1 / (k2 - k1) * ((-k1 * X[:, 1]).exp() - (-k2 * X[:, 1]).exp())

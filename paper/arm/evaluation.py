@@ -91,7 +91,7 @@ class ArmRecorder(Recorder):
         self.maps: dict[str, Any] = {}
 
     def of_policy(self, episode: int) -> dict[str, Any]:
-        """Return nothing: evaluations have lists of their own, as there are fewer than episodes."""
+        """Evaluate the policy after some episodes; the record has lists of their own for these."""
         if episode % self.settings.evaluate_every == 0:
             self.evaluate(episode)
         return {}

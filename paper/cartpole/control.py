@@ -178,7 +178,7 @@ def trials_table(
     own: pd.DataFrame, measure: str, labels: Mapping[Any, str], shown: Sequence[int],
     late: tuple[int, int], compared: tuple[int, int], form: str,
 ) -> str:  # fmt: skip
-    """Return costs at some trials, the worst of later ones, and paired differences from CKA."""
+    """Return a measure at some trials, the worst later one, and paired differences from CKA."""
     curves = Curves(own, measure)
 
     def gap(part: pd.DataFrame) -> str:

@@ -47,7 +47,7 @@ def fixed_starts(n: int) -> Tensor:
 
 
 def evaluate(agent: DynaSAC, settings: CartPole) -> float:
-    """Return the mean cost of the deterministic policy over the fixed starts, without chance."""
+    """Return the mean cost of the deterministic policy over fixed starts; draw no numbers."""
     system = cart_pole(encode_angle=settings.encode_angle, episode_length=settings.episode_length)
     task = replace(
         system.task(PhysicsDynamics(system.spec, true_physics())), initial_states=fixed_starts

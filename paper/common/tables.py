@@ -121,7 +121,7 @@ def mean_error(
 
 
 def ratio_of(value: str, name: str, other: str) -> Cell:
-    """Return a cell with the geometric mean of two learners' ratios and its 95 % interval."""
+    """Return a cell with the geometric mean of two learners' paired ratios, and its interval."""
     return lambda runs: paired(runs, value, "learner", name, other, ratio=True).ratio()
 
 

@@ -63,7 +63,7 @@ class Difference:
         return f"{self.mean:+{form}}" + ("" if np.isnan(self.error) else f" ± {self.error:{form}}")
 
     def ratio(self, form: str = ".2f") -> str:
-        """Return the geometric mean of ratios and its 95 % interval, of logarithms."""
+        """Return, for differences of logarithms, the geometric mean ratio and its 95 % interval."""
         if np.isnan(self.mean):
             return ""
         middle, low, high = np.exp([self.mean, self.low, self.high])

@@ -46,7 +46,7 @@ class Machine:
     env: Callable[..., gym.Env[Any, Any]] | None = None
 
     def physics(self, kind: Physics = "crude") -> ODEPhysics:
-        """Return the next values of the states that move."""
+        """Return the physics of the next values of the states that move."""
         guesses = {name: known.guess for name, known in self.believed.items()}
         fixed = self.true if kind == "true" else dict.fromkeys(self.true, 0.0) | guesses
         return ODEPhysics(

@@ -77,7 +77,7 @@ def _line(function: Callable[[Tensor], Tensor], low: float = 0.0, high: float = 
 
 
 def relative(option: bool, seed: int) -> Predicted:
-    """Predict an output of three decades with noise of 5 %; errors are of its logarithm."""
+    """Predict an output of three decades with noise of 5 %; errors are relative."""
     draw = np.random.default_rng(seed)
 
     def physics(X: Tensor) -> Tensor:
@@ -214,7 +214,7 @@ def drift(option: bool, seed: int) -> Predicted:
 
 
 def vanishing(option: bool, seed: int) -> Predicted:
-    """Predict a ball's fall in air: f_p has no drag, which is small at first; plain: free delta."""
+    """Estimate gravity by a fall in air: f_p has no drag, which begins small; plain: free delta."""
     draw = np.random.default_rng(seed)
     height, drag, g = draw.uniform(40, 60), draw.uniform(0.002, 0.02), 9.81
 

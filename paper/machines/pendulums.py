@@ -54,7 +54,7 @@ class Machine:
         }
 
     def physics(self, parameters: str | Parameters = "unknown") -> ODEPhysics:
-        """Return a control step, its parameters unknown, or by the name of a set, or given."""
+        """Return the physics of a step, its parameters unknown, by the name of a set, or given."""
         options: dict[str, Any] = {
             "step": STEP,
             "state_dim": self.spec.state_dim,

@@ -112,7 +112,7 @@ def _scores(
 
 
 def _lost(known: System) -> dict[str, Any]:
-    """Return scores of free runs without an end: infinite errors, and intervals without values."""
+    """Return scores of free runs without an end: infinite errors, and a coverage of zero."""
     d = len(known.machine.spec.states)
     steps = [str(ahead) for ahead in (1, *HORIZONS)]
     return {

@@ -70,7 +70,7 @@ def rates(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
 
 
 def physics(structure: str, values: Mapping[str, float] | None = None) -> ODEPhysics:
-    """Return the next levels, with unknown parameters, or these."""
+    """Return the physics of the next levels, with unknown parameters, or these."""
     fixed: dict[str, Any] = {**FIXED[structure], **(values or {})}
     unknowns = {name: known for name, known in UNKNOWNS.items() if name not in fixed}
     options: dict[str, Any] = {"step": STEP, "state_dim": 2, "substeps": 4}

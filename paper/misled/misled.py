@@ -39,7 +39,7 @@ def _peak(X: Tensor, middle: list[float], widths: list[float], height: float) ->
 
 
 def _reactor(X: Tensor, rate: float, loss: float, energy: float) -> Tensor:
-    """Return the yield of B in A -> B -> C, in per cent, by time (0.2-5 h) and heat (300-360)."""
+    """Return the yield of B in A -> B -> C, in per cent, by time (0.2-5 h) and K (300-360)."""
     time, heat = 0.2 + 4.8 * X[:, 0], (X[:, 1] * 60 - 30) / 330
     one, two = rate * (4 * heat).exp(), loss * (energy * heat).exp()
     return 100 * one / (two - one) * ((-one * time).exp() - (-two * time).exp())

@@ -29,7 +29,7 @@ class Parameters(Experiment):
             "creep": "creep: before it comes to rest",
             "inhibitor": "enzyme: three constants",
             "spectrum": "spectrum: nine parameters",
-            "pendulum": "pendulum: sign and phase fold",
+            "pendulum": "pendulum: two solutions, by sign and phase",
             "focus": "focus: either way",
             "alias": "oscillation: observed too seldom",
             "radar": "oscillation: the same, noisy",

@@ -64,13 +64,13 @@ def measured(name: str, experiment: Emps) -> tuple[Tensor, Tensor]:
 
 
 def spec_of(experiment: Emps) -> StateSpec:
-    """Return position and velocity, of which models predict the latter alone."""
+    """Return the spec of position and velocity, of which models predict the latter alone."""
     step = _SAMPLING * experiment.every
     return StateSpec(["q", "v"], ["force"], step=step, integrated={"q": "v"})
 
 
 def physics(step: float, values: Sequence[float] | None = None) -> FunctionPhysics:
-    r"""Return the next position and velocity, with unknown parameters or these.
+    r"""Return the physics of the next state, with unknown parameters or these.
 
     :math:`M q'' = F - F_v q' - F_c \operatorname{sign} q' - c` (Janot et al. 2019). Dry friction
     decelerates, or holds what it has stopped, in each of five substeps.

@@ -38,11 +38,11 @@ class System(NamedTuple):
     earlier: int = 0  # how many earlier actions a GP that adjusts f_p reads
 
     def physics(self, values: list[float] | None = None) -> FunctionPhysics:
-        """Return the next states, with unknown parameters or these."""
+        """Return the physics of the next states, with unknown parameters or these."""
         return law_of(self.following, self.unknowns, values)
 
     def spec(self, earlier: int = 0) -> StateSpec:
-        """Return states and actions, with so many earlier actions, or as many as f_p reads."""
+        """Return the spec, with so many earlier actions, or as many as f_p reads."""
         lags = _previous("u", max(earlier, self.delay))
         last = f"u_{self.delay}" if self.delay else "u"
         names = [*self.states, *lags]
@@ -58,7 +58,7 @@ def _previous(name: str, lags: int) -> dict[str, str]:
 
 
 def narx_spec(outputs: int, actions: int) -> StateSpec:
-    """Return the output with so many values of output and action, the newest included."""
+    """Return the spec of so many values of output and action, the newest included."""
     previous = {**_previous("y", outputs - 1), **_previous("u", actions - 1)}
     return StateSpec(["y", *previous], ["u"], previous=previous)
 
@@ -72,7 +72,7 @@ def records(states: Tensor, actions: Tensor, spec: StateSpec) -> Records:
 
 
 def _loop(X: Tensor, p: ParameterValues) -> Tensor:
-    """Return the rates of a ball that a controller holds: u = -gain y, of a delayed place."""
+    """Return the next state of a ball held by a controller, u = -gain y, of a delayed place."""
     y, v, u = X.unbind(-1)
     pull = p.frequency**2 * (-u / p.gain - y) - 2 * p.damping * p.frequency * v
     faster = v + 0.1 * pull
@@ -80,7 +80,7 @@ def _loop(X: Tensor, p: ParameterValues) -> Tensor:
 
 
 def _two_lags(X: Tensor, p: ParameterValues) -> Tensor:
-    """Return the rates of two mixed vessels, one after the other."""
+    """Return the next state of two mixed vessels, one after the other."""
     y, mixed, u = X.unbind(-1)
     first, second = (1 - torch.exp(-1 / lag) for lag in (p.lag, p.lag_before))
     return torch.stack(
@@ -89,7 +89,7 @@ def _two_lags(X: Tensor, p: ParameterValues) -> Tensor:
 
 
 def _belt(X: Tensor, p: ParameterValues) -> Tensor:
-    """Return the rates of a pulley on an elastic belt behind motors that lag."""
+    """Return the next state of a pulley on an elastic belt behind motors that lag."""
     _, speed, rate, motor, u = X.unbind(-1)
     for _ in range(4):
         motor = motor + 0.25 * (u - motor) / p.lag
@@ -100,7 +100,7 @@ def _belt(X: Tensor, p: ParameterValues) -> Tensor:
 
 
 def _tanks(X: Tensor, p: ParameterValues) -> Tensor:
-    """Return Torricelli's outflows of two equal tanks; pumped is a power of the voltage."""
+    """Return the next levels of two equal tanks by Torricelli; inflow is a power of the voltage."""
     lower, upper, u = X.unbind(-1)
     inflow = p.pump * u.clamp_min(1e-3) ** p.power
     for _ in range(2):

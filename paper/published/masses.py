@@ -176,7 +176,7 @@ def _tensors(table: pd.DataFrame) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _trees(train: pd.DataFrame, residual: Tensor, test: pd.DataFrame) -> Tensor:
-    """Return gradient boosting, by scikit-learn, of the residual of the fitted drop."""
+    """Predict the residual of the fitted drop by gradient boosting of scikit-learn."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
     trees = HistGradientBoostingRegressor(max_iter=1000, random_state=0)
