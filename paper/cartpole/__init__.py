@@ -76,7 +76,7 @@ class Control(Experiment):
         "gpadjust.rl.DynaOptions",
         "stable_baselines3.SAC",
     )
-    cheap: ClassVar[Mapping[str, Any]] = {"episodes": 2}
+    cheap: ClassVar[Mapping[str, Any]] = {"episodes": 1}
     chaotic: ClassVar[bool] = True
     digits: ClassVar[int] = 5
     known: ClassVar[Mapping[str, Scenario]]
