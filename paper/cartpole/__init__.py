@@ -43,6 +43,7 @@ class Control(Experiment):
     SAC's were tuned on the cart-pole with its true dynamics as the model.
     """
 
+    runs: int = 5  # seeds of each learner
     episodes: int = 50
     """real episodes of a run"""
     episode_length: int = 25
