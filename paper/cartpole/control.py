@@ -162,6 +162,9 @@ def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
 
 def foresight(episodes: pd.DataFrame, experiment: Control) -> str:
     """Return scores of the models on episodes before they had them, from the second on."""
+    scores = ["nlpd", "coverage", *(f"rmse_{state}" for state in experiment.rmses)]
+    # Without models there are no such columns.
+    episodes = episodes.reindex(columns=[*dict.fromkeys([*episodes.columns, *scores])])
     scored = episodes[(episodes["episode"] > 1)]
     first = f"rmse_{next(iter(experiment.rmses))}"
     with_models = {*episodes[episodes[first].notna()]["learner"]}

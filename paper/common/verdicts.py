@@ -18,6 +18,7 @@ Verdict = Literal[
 _FROM_WORST: tuple[Verdict, ...] = (
     *("not reproduced", "inconclusive", "undetermined", "reproduced", "beaten"),
 )
+FEWEST = 4  # runs of which a verdict is given
 Finding = tuple[Verdict, str]
 
 
@@ -190,7 +191,7 @@ class Claim(NamedTuple):
 def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
     """Judge all claims, each by the seeds with which all its learners reached the last episode.
 
-    One of fewer than two such seeds is not judged.
+    One of fewer than two such seeds is not judged, one of fewer than ``FEWEST`` is inconclusive.
     """
     found = []
     for claim in claims:
@@ -202,6 +203,7 @@ def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
             found.append(Judged(claim.id, claim.text, "not run", lacking))
             continue
         verdict, measured = claim.decide(curves.restricted(shared))
+        verdict = verdict if len(shared) >= FEWEST else "inconclusive"
         measured = f"{counted(len(shared))}: {measured}"
         found.append(Judged(claim.id, claim.text, verdict, measured))
     return found

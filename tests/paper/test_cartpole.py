@@ -9,6 +9,7 @@ from gpadjust.control.episodes import generators
 from gpadjust.rl import DynaSAC
 from paper.cartpole import CartPole
 from paper.cartpole.claims import CLAIMS
+from paper.cartpole.control import foresight, load
 from paper.cartpole.system import evaluate, fixed_starts
 from paper.common.runner import main, runs_file
 from paper.common.verdicts import Curves, judge
@@ -81,6 +82,12 @@ class TestCartPole:
             in_model = 0 if episode > 25 else settings.updates_in_model()
             of_others = settings.updates_after(episode, model_free=False)
             assert settings.updates_after(episode, model_free=True) == in_model + of_others
+
+    @pytest.mark.parametrize("errors", [{}, {"rmse": [None, [0.1] * 4]}])
+    def test_runs_without_models_or_variances_have_tables(self, errors):
+        runs = [{"scenario": "phy", "seed": 0, "episodes": {"cost": [0.9, 0.8], **errors}}]
+        text = foresight(load(runs, "episodes", CartPole()), CartPole())
+        assert ("| Dyna-Phy |  |  | 0.1 |" in text) == bool(errors)
 
     def test_verdicts(self):
         found = judged(
