@@ -46,7 +46,7 @@ def _physics_alone(curves: Curves) -> Finding:
 def _gp(curves: Curves) -> Finding:
     held = curves.first_below("gp-paper", 0.5) is None
     ends = curves.window("gp-paper", 41, 50)
-    learnt = f", at most 0.5 in {(ends <= 0.5).sum()} runs"
+    learnt = f", at most 0.5 in {counted(int((ends <= 0.5).sum()))}"
     return reproduced(held), _described(curves, "gp-paper") + learnt + _beside(curves, "gp")
 
 
