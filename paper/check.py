@@ -54,6 +54,8 @@ def check(experiments: dict[str, str], known: bool = True) -> dict[str, str]:
     jobs.sort(key=lambda job: job[:2])
     spent = [*accumulate(cost for cost, *_ in jobs)]
     chosen = [job[1:] for job, until in zip(jobs, spent, strict=True) if until <= BUDGET]
+    # Older runs have no processor, by which alone numbers are the same.
+    decided = {name for name, _, _, run in chosen if run.get("processor")}
     for _, name, *_ in jobs[len(chosen) :]:
         print(f"{name}: takes too long, not made again")
     made = Parallel(n_jobs=os.cpu_count() or 1, return_as="generator")(
@@ -61,7 +63,7 @@ def check(experiments: dict[str, str], known: bool = True) -> dict[str, str]:
     )
     for name, reason, seconds in made:
         print(f"{name}: {reason or 'the same'} ({seconds:.0f} s)", flush=True)
-        if reason:
+        if reason and name in decided:
             stale[name] = reason
     return stale
 
@@ -101,8 +103,8 @@ def _hindrance(run: Run, experiment: Experiment) -> str:
         experiment.check()
     except ImportError as error:
         return str(error).splitlines()[0].rstrip(".")
-    is_other = experiment.chaotic and run.get("processor") != processor()
-    return "was made by another processor" if is_other else ""
+    by = run.get("processor", processor())
+    return "was made by another processor" if by != processor() else ""
 
 
 def _again(name: str, experiment: Experiment, case: Case, run: Run) -> tuple[str, str, float]:

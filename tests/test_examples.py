@@ -12,6 +12,7 @@ GALLERY = (ROOT / "docs" / "gallery.md").read_text()
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Optimization failed:RuntimeWarning")  # BoTorch tries again
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.stem)
 def test_an_example_runs_and_prints_what_the_gallery_shows(example, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

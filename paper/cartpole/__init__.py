@@ -78,7 +78,6 @@ class Control(Experiment):
         "stable_baselines3.SAC",
     )
     cheap: ClassVar[Mapping[str, Any]] = {"episodes": 1}
-    chaotic: ClassVar[bool] = True
     digits: ClassVar[int] = 5
     known: ClassVar[Mapping[str, Scenario]]
     """all learners"""

@@ -73,8 +73,6 @@ class Experiment:
     """whose versions decide the numbers; of the library itself the commit is recorded"""
     cheap: ClassVar[Mapping[str, Any]] = {}
     """settings with which `python -m paper check` makes the beginning of a long run again"""
-    chaotic: ClassVar[bool] = False
-    """whether rounding decides a run, so that only the same processor makes it again"""
     digits: ClassVar[int] = 6
     """significant digits of the numbers that are kept"""
 

@@ -96,10 +96,23 @@ def test_runs_of_unrecorded_code_are_stale_without_being_made_again(squares):
     assert check.check(known) == dict.fromkeys(["toy a", "toy b"], "its commit is not recorded")
 
 
+def test_a_difference_from_a_run_of_an_unknown_processor_does_not_count(
+    squares, monkeypatch, capsys
+):
+    experiment, known = squares
+    file = runs_file(experiment)
+    runs = [{k: v for k, v in run.items() if k != "processor"} for run in file.read().values()]
+    file.path.unlink()
+    for run in runs:
+        file.append(run)
+    monkeypatch.setattr(Toy, "run", lambda self, kind, seed: {"value": -1})
+    assert check.check(known) == {}
+    assert "and is now -1" in capsys.readouterr().out
+
+
 def test_what_cannot_be_made_again_here_is_not_stale(squares, monkeypatch, capsys):
     _, known = squares
     monkeypatch.setattr(Toy, "run", lambda self, kind, seed: {"value": -1})
-    monkeypatch.setattr(Toy, "chaotic", True)
     assert {*check.check(known)} == {"toy a", "toy b"}  # the processor is the same
     monkeypatch.setattr(check, "processor", lambda: "another")
     assert check.check(known) == {}
