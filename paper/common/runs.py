@@ -132,8 +132,8 @@ def processor() -> str:
     """Return the processor's name and version, and the instructions in use."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
-    said = dict(re.split(r"\s*:\s*", line, maxsplit=1) for line in lines if ":" in line)
-    parts = [said.get(name) for name in ("model name", "cpu family", "model", "stepping")]
+    entries = dict(re.split(r"\s*:\s*", line, maxsplit=1) for line in lines if ":" in line)
+    parts = [entries.get(name) for name in ("model name", "cpu family", "model", "stepping")]
     parts += [platform.machine(), torch.backends.cpu.get_cpu_capability()]
     return " ".join(part for part in parts if part)
 
