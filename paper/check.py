@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
-import time
+import subprocess
+import sys
+import tarfile
 from collections.abc import Iterator
 from itertools import accumulate
+from pathlib import Path
 from pkgutil import resolve_name
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -22,11 +27,19 @@ from paper.common.runner import (
     stale_list,
     write_tables,
 )
-from paper.common.runs import processor, rounded
+from paper.common.runs import git, rounded
 from paper.pages import QUOTING, report, results, wrong_quotes
 
 CLOSE = 1e-3  # of numbers that count as the same
 BUDGET = 400.0  # CPU seconds of all cases that are made again: 200 s of two cores
+ROOT = Path(__file__).parents[1]
+_CASE = """
+import json, pathlib, pkgutil, sys, torch
+torch.set_num_threads(1)
+kind, changes, case = json.loads(sys.argv[1])
+experiment = pkgutil.resolve_name(kind)(out=pathlib.Path()).changed(changes)
+print(json.dumps(experiment.run(*case)))
+"""
 
 
 def check(experiments: dict[str, str], known: bool = True) -> dict[str, str]:
@@ -44,26 +57,24 @@ def check(experiments: dict[str, str], known: bool = True) -> dict[str, str]:
             name = f"{experiment.name} {learner}"
             if not known and name in stale_list():
                 continue
-            older, hindrance = _older(run, experiment), _hindrance(run, experiment)
+            older, missing = _older(run, experiment), _missing(experiment)
             if older:
                 stale[name] = older
-            elif hindrance:
-                print(f"{name}: {hindrance}, not made again")
+            elif missing:
+                print(f"{name}: {missing}, not made again")
             else:
                 jobs.append((_cost(run, experiment), name, experiment, case, run))
     jobs.sort(key=lambda job: job[:2])
     spent = [*accumulate(cost for cost, *_ in jobs)]
     chosen = [job[1:] for job, until in zip(jobs, spent, strict=True) if until <= BUDGET]
-    # Older runs have no processor, by which alone numbers are the same.
-    decided = {name for name, _, _, run in chosen if run.get("processor")}
     for _, name, *_ in jobs[len(chosen) :]:
         print(f"{name}: takes too long, not made again")
     made = Parallel(n_jobs=os.cpu_count() or 1, return_as="generator")(
         delayed(_again)(*job) for job in chosen
     )
-    for name, reason, seconds in made:
-        print(f"{name}: {reason or 'the same'} ({seconds:.0f} s)", flush=True)
-        if reason and name in decided:
+    for name, reason, found in made:
+        print(f"{name}: {found}", flush=True)
+        if reason:
             stale[name] = reason
     return stale
 
@@ -97,22 +108,46 @@ def _older(run: Run, experiment: Experiment) -> str:
     return made_otherwise({**run, "versions": {}}, experiment)
 
 
-def _hindrance(run: Run, experiment: Experiment) -> str:
-    """Return why a run cannot be made again here; empty if it can."""
+def _missing(experiment: Experiment) -> str:
+    """Return what an experiment needs and is not installed; empty if it is."""
     try:
         experiment.check()
     except ImportError as error:
         return str(error).splitlines()[0].rstrip(".")
-    by = run.get("processor", processor())
-    return "was made by another processor" if by != processor() else ""
+    return ""
 
 
-def _again(name: str, experiment: Experiment, case: Case, run: Run) -> tuple[str, str, float]:
+def _again(name: str, experiment: Experiment, case: Case, run: Run) -> tuple[str, str, str]:
+    """Make a case again; return its name, why it is stale (empty if it is not), and what is found.
+
+    Another processor gives other numbers, too. So the code that made the record decides, on this
+    machine: a case is stale if that code and today's differ here.
+    """
     torch.set_num_threads(1)
-    start = time.process_time()
-    results = experiment.changed(experiment.cheap).run(*case)
-    made = difference(run, rounded(results, experiment.digits))
-    return name, made, time.process_time() - start
+    made = rounded(experiment.changed(experiment.cheap).run(*case), experiment.digits)
+    differs = difference(run, made)
+    if not differs:
+        return name, "", "the same"
+    recorded = by_code_of(run["commit"], experiment, case)
+    if recorded is None:
+        return name, "", f"{differs}; this clone does not have the record's commit {run['commit']}"
+    stale = difference(recorded, made)
+    return name, stale, stale or f"{differs}; on this machine the record's code gives the same"
+
+
+def by_code_of(commit: str, experiment: Experiment, case: Case) -> Run | None:
+    """Return a cheap case by the code of a commit; None if git does not have that commit."""
+    kind = f"{type(experiment).__module__}:{type(experiment).__qualname__}"
+    asked = json.dumps([kind, dict(experiment.cheap), case])
+    with TemporaryDirectory() as folder:
+        if git(ROOT, "archive", f"--output={folder}/code.tar", commit.rstrip("+")) is None:
+            return None
+        with tarfile.open(f"{folder}/code.tar") as code:
+            code.extractall(folder, filter="data")
+        command = [sys.executable, "-c", _CASE, asked]
+        done = subprocess.run(command, cwd=folder, check=True, stdout=subprocess.PIPE, text=True)
+    made: Run = rounded(json.loads(done.stdout.splitlines()[-1]), experiment.digits)
+    return made
 
 
 def difference(old: Any, new: Any, place: str = "") -> str:

@@ -17,7 +17,7 @@ import torch
 from tqdm import tqdm
 
 from paper.common.experiment import Case, Experiment, Run, Table
-from paper.common.runs import RunsFile, commit_of, differences, processor, rounded, versions
+from paper.common.runs import RunsFile, commit_of, differences, rounded, versions
 from paper.common.tables import as_document, markdown
 
 
@@ -145,7 +145,6 @@ def run_one(experiment: Experiment, case: Case) -> Case:
         "settings": _described(experiment, case[:-1]),
         "defaults": experiment.defaults(),
         "versions": versions(experiment.packages),
-        "processor": processor(),
         "commit": commit,
         "date": date,
     }

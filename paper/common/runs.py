@@ -6,7 +6,6 @@ import json
 import math
 import os
 import platform
-import re
 import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -15,12 +14,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import torch
 from filelock import FileLock
 
 from paper.common.experiment import Case, Run
 
-IDENTIFYING = ("settings", "defaults", "versions", "processor", "commit", "date")
+IDENTIFYING = ("settings", "defaults", "versions", "commit", "date")
 """Entries of a run that say how it was made."""
 
 
@@ -127,17 +125,6 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
     return numbers
 
 
-@cache
-def processor() -> str:
-    """Return the processor's name and version, and the instructions in use."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    entries = dict(re.split(r"\s*:\s*", line, maxsplit=1) for line in lines if ":" in line)
-    parts = [entries.get(name) for name in ("model name", "cpu family", "model", "stepping")]
-    parts += [platform.machine(), torch.backends.cpu.get_cpu_capability()]
-    return " ".join(part for part in parts if part)
-
-
 def rounded(value: Any, digits: int) -> Any:
     """Round numbers to significant digits, also in lists and dictionaries; nan becomes None."""
     if isinstance(value, float):
@@ -162,15 +149,15 @@ def commit_of(root: Path) -> tuple[str, str] | None:
     Returns:
         None if it is none (as in an unpacked archive), has no commit yet, or git does not answer.
     """
-    shown = _git(root, "show", "--no-patch", "--format=%H %cs", "HEAD")
+    shown = git(root, "show", "--no-patch", "--format=%H %cs", "HEAD")
     if shown is None or not (root / ".git").exists():  # ours is but a folder of another's
         return None
     command = ("status", "--porcelain", "--untracked-files=no", "--", ".", ":!paper/results")
     commit, date = shown.split()
-    return f"{commit}+" if _git(root, *command) else commit, date
+    return f"{commit}+" if git(root, *command) else commit, date
 
 
-def _git(root: Path, *command: str) -> str | None:
+def git(root: Path, *command: str) -> str | None:
     """Return the output of a git command; None if it fails or git is not installed."""
     try:
         done = subprocess.run(

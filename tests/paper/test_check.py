@@ -10,6 +10,7 @@ from paper.__main__ import EXPERIMENTS
 from paper.check import difference
 from paper.common import runner
 from paper.common.runner import main, runs_file, stale_list, stamp
+from paper.common.runs import commit_of
 from paper.pages import PAPER, QUOTING, results, wrong_quotes
 from tests.paper.toy import Toy
 
@@ -74,52 +75,48 @@ def squares(tmp_path, monkeypatch):
     return experiment, {"toy": "tests.paper.toy:Toy"}
 
 
-def test_a_change_of_the_code_makes_a_learner_stale(squares, monkeypatch):
+def rewrite(experiment, **entries):
+    """Change entries of all recorded runs."""
+    file = runs_file(experiment)
+    runs = [{**run, **entries} for run in file.read().values()]
+    file.path.unlink()
+    for run in runs:
+        file.append(run)
+
+
+def test_stale_learners_are_named_below_their_tables(squares):
     experiment, known = squares
     runs = [*runs_file(experiment).read().values()]
     assert check.check(known) == {}
     assert stamp(experiment, runs) == "*Runs: 4 by ffffffff of 2026-01-01.*"
-    monkeypatch.setattr(Toy, "run", lambda self, kind, seed: {"value": {"a": 9, "b": seed}[kind]})
-    assert [*check.check(known)] == ["toy a"]
     runner.STALE.write_text("toy a\n")
-    assert check.check(known, known=False) == {}
+    rewrite(experiment, commit=None)
+    assert check.check(known) == dict.fromkeys(["toy a", "toy b"], "its commit is not recorded")
+    assert [*check.check(known, known=False)] == ["toy b"]
     assert stamp(experiment, runs).endswith(" Stale: today's code gives other numbers (a).*")
 
 
-def test_runs_of_unrecorded_code_are_stale_without_being_made_again(squares):
-    experiment, known = squares
-    file = runs_file(experiment)
-    runs = [{**run, "commit": None} for run in file.read().values()]
-    file.path.unlink()
-    for run in runs:
-        file.append(run)
-    assert check.check(known) == dict.fromkeys(["toy a", "toy b"], "its commit is not recorded")
-
-
-def test_a_difference_from_a_run_of_an_unknown_processor_does_not_count(
-    squares, monkeypatch, capsys
-):
-    experiment, known = squares
-    file = runs_file(experiment)
-    runs = [{k: v for k, v in run.items() if k != "processor"} for run in file.read().values()]
-    file.path.unlink()
-    for run in runs:
-        file.append(run)
-    monkeypatch.setattr(Toy, "run", lambda self, kind, seed: {"value": -1})
-    assert check.check(known) == {}
-    assert "and is now -1" in capsys.readouterr().out
-
-
-def test_what_cannot_be_made_again_here_is_not_stale(squares, monkeypatch, capsys):
+def test_what_is_not_installed_is_not_stale(squares, monkeypatch, capsys):
     _, known = squares
     monkeypatch.setattr(Toy, "run", lambda self, kind, seed: {"value": -1})
-    assert {*check.check(known)} == {"toy a", "toy b"}  # the processor is the same
-    monkeypatch.setattr(check, "processor", lambda: "another")
-    assert check.check(known) == {}
-    assert "toy a: was made by another processor, not made again" in capsys.readouterr().out
     monkeypatch.setattr(Toy, "check", lambda self: import_module("not_there"))
     assert check.check(known) == {}
     assert "toy a: No module named 'not_there', not made again" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_code_of_the_record_decides_between_the_machine_and_a_change(
+    squares, monkeypatch, capsys
+):
+    experiment, known = squares
+    rewrite(experiment, commit=commit_of(check.ROOT)[0], value=5, took=0)
+    assert check.check(known) == {}  # the committed code gives 0 here, as today's does
+    assert "toy a: value was 5 and is now 0.0; on this machine" in capsys.readouterr().out
+    monkeypatch.setattr(Toy, "run", lambda self, kind, seed: {"value": {"a": 9, "b": seed}[kind]})
+    assert check.check(known) == {"toy a": "value was 0.0 and is now 9"}
+    rewrite(experiment, commit="f" * 40)
+    assert check.check(known) == {}
+    assert f"this clone does not have the record's commit {'f' * 40}" in capsys.readouterr().out
 
 
 @pytest.mark.slow
