@@ -132,20 +132,19 @@ class WeightedSum:
             total = total + k * weight.unsqueeze(-1) * other.weights[term.name].unsqueeze(-2)
         return total
 
-    def cross_times(self, other: WeightedSum, vector: Tensor) -> Tensor:
-        r"""Return the covariances with another sum times v, ``... x S x m x n'``, term by term.
+    def cross_times(self, other: WeightedSum, vectors: Tensor) -> Tensor:
+        r"""Return the covariances with another sum times V, ``... x S x m x n' x k``, term by term.
 
-        .. math:: \sum_t w_t(x) \, (k_t(x, x') + \kappa_t) \, (w'_t(x') \circ v)
+        .. math:: \sum_t w_t(x) \, (k_t(x, x') + \kappa_t) \, (w'_t(x') \circ V)
         """
-        total = torch.zeros_like(self.mean)
+        total = torch.zeros_like(self.mean).unsqueeze(-1)
         for term, weight in self._parts():
             if term.name in other.weights:
-                v = other.weights[term.name] * vector
-                part = self._constant(term) * v.sum(-1, keepdim=True)
+                V = other.weights[term.name].unsqueeze(-1) * vectors
+                part = self._constant(term).unsqueeze(-1) * V.sum(-2, keepdim=True)
                 if term.kernel is not None:
-                    k = other.toward(term, self.x)
-                    part = part + self._process(term, k @ v.unsqueeze(-1)).squeeze(-1)
-                total = total + weight * part
+                    part = part + self._process(term, other.toward(term, self.x) @ V)
+                total = total + weight.unsqueeze(-1) * part
         return total
 
     def with_pull_back(self) -> tuple[Tensor, PullBack]:

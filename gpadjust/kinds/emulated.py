@@ -191,10 +191,13 @@ class _Components:
     def _moments(self, function: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return the mean ``m x N`` and the components ``m x N x K``."""
         of_places, of_runs, of_means = self.weights
-        mean, cross = self.data.mean(function)  # S x m x N (x n)
-        components = (function.cross(self.places) @ of_places - cross @ of_runs).mean(0)
+        both = torch.cat([of_runs, self.data.alpha.unsqueeze(-1)], -1)
+        both = both * self.data.observed.unsqueeze(-1)
+        by_runs = function.cross_times(self.data.train, both)
+        components = function.cross_times(self.places, of_places) - by_runs[..., :-1]
+        mean = function.mean + by_runs[..., -1]  # S x m x N
         away = (mean - mean.mean(0)).movedim(0, -1)  # m x N x S
-        return mean.mean(0), components + away @ of_means / len(mean)
+        return mean.mean(0), components.mean(0) + away @ of_means / len(mean)
 
     def _variance(self, function: WeightedSum) -> Tensor:
         """Return the variance by the emulator, ``m x N``."""
