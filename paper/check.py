@@ -136,7 +136,7 @@ def _again(name: str, experiment: Experiment, case: Case, run: Run) -> tuple[str
 
 
 def by_code_of(commit: str, experiment: Experiment, case: Case) -> Run | None:
-    """Return a cheap case by the code of a commit; None if git does not have that commit."""
+    """Return a cheap case by the code of a commit; nothing if that fails; None without a commit."""
     kind = f"{type(experiment).__module__}:{type(experiment).__qualname__}"
     asked = json.dumps([kind, dict(experiment.cheap), case])
     with TemporaryDirectory() as folder:
@@ -145,7 +145,9 @@ def by_code_of(commit: str, experiment: Experiment, case: Case) -> Run | None:
         with tarfile.open(f"{folder}/code.tar") as code:
             code.extractall(folder, filter="data")
         command = [sys.executable, "-c", _CASE, asked]
-        done = subprocess.run(command, cwd=folder, check=True, stdout=subprocess.PIPE, text=True)
+        done = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        return {}
     made: Run = rounded(json.loads(done.stdout.splitlines()[-1]), experiment.digits)
     return made
 
@@ -155,15 +157,12 @@ def difference(old: Any, new: Any, place: str = "") -> str:
 
     Times do not count, nor what a cheaper case has not: later elements of a list.
     """
-    if isinstance(new, dict):
-        for name, value in new.items():
-            if "seconds" not in str(name):
-                inner = difference(old.get(name), value, f"{place}.{name}".lstrip("."))
-                if inner:
-                    return inner
-        return ""
-    if isinstance(new, list | tuple):
-        pairs = zip(old or [], new, strict=False)
+    if isinstance(new, dict) and isinstance(old, dict):
+        names = (name for name in new if "seconds" not in str(name))
+        each = (difference(old.get(n), new[n], f"{place}.{n}".lstrip(".")) for n in names)
+        return next((inner for inner in each if inner), "")
+    if isinstance(new, list | tuple) and isinstance(old, list | tuple):
+        pairs = zip(old, new, strict=False)
         each = (difference(a, b, f"{place}[{i}]") for i, (a, b) in enumerate(pairs))
         return next((inner for inner in each if inner), "")
     is_number = isinstance(new, float | int) and isinstance(old, float | int)

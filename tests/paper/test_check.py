@@ -60,6 +60,8 @@ def test_differences_of_runs():
     assert difference(old, {"list": [1.0, 2.1]}) == "list[1] was 2.0 and is now 2.1"
     assert difference(old, {"x": {"y": [0.6]}}) == "x.y[0] was 0.5 and is now 0.6"
     assert difference(old, {"none": 1.0}) == "none was None and is now 1.0"
+    assert difference({}, {"x": {"y": [0.5]}}) == "x was None and is now {'y': [0.5]}"
+    assert difference({}, {"list": [1.0]}) == "list was None and is now [1.0]"
 
 
 @pytest.fixture
