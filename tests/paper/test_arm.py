@@ -99,7 +99,9 @@ class TestArm:
         assert found["A2"].verdict == found["A3"].verdict == found["A4"].verdict == "reproduced"
         assert found["A1"].verdict == "undetermined"  # it still falls at the end
         assert arm_verdicts(mf=lambda e: 20.0)["A1"].verdict == "not reproduced"
-        assert found["A5"].verdict == "not reproduced"
+        far = arm_verdicts(phy=lambda e: 9.5, cka=lambda e: 5, rra=lambda e: 8)
+        assert far["A5"].verdict == "not reproduced"
+        assert found["A5"].verdict == "reproduced"  # 1 cm above CKA
         assert found["A6"].verdict == "reproduced"
         assert "at 121 of 121 targets by CKA, at none by model-free" in found["A6"].measured
         assert arm_verdicts(cka=lambda e: 5)["A4"].measured == "no results of mf"
