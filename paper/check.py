@@ -138,13 +138,13 @@ def _again(name: str, experiment: Experiment, case: Case, run: Run) -> tuple[str
 def by_code_of(commit: str, experiment: Experiment, case: Case) -> Run | None:
     """Return a cheap case by the code of a commit; nothing if that fails; None without a commit."""
     kind = f"{type(experiment).__module__}:{type(experiment).__qualname__}"
-    asked = json.dumps([kind, dict(experiment.cheap), case])
+    arguments = json.dumps([kind, dict(experiment.cheap), case])
     with TemporaryDirectory() as folder:
         if git(ROOT, "archive", f"--output={folder}/code.tar", commit.rstrip("+")) is None:
             return None
         with tarfile.open(f"{folder}/code.tar") as code:
             code.extractall(folder, filter="data")
-        command = [sys.executable, "-c", _CASE, asked]
+        command = [sys.executable, "-c", _CASE, arguments]
         done = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode:
         return {}

@@ -107,6 +107,7 @@ def test_what_is_not_installed_is_not_stale(squares, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(commit_of(check.ROOT) is None, reason="an unpacked archive has no history")
 def test_the_code_of_the_record_decides_between_the_machine_and_a_change(
     squares, monkeypatch, capsys
 ):
