@@ -209,11 +209,9 @@ def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
     return found
 
 
-def reproduced(held: bool, beaten: bool = False) -> Verdict:
+def reproduced(held: bool) -> Verdict:
     """Return the verdict on a claim of the paper."""
-    if not held:
-        return "not reproduced"
-    return "beaten" if beaten else "reproduced"
+    return "reproduced" if held else "not reproduced"
 
 
 def between(ends: Sequence[float], low: float = -np.inf, high: float = np.inf) -> Verdict:

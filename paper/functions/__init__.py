@@ -10,6 +10,7 @@ from paper.common.learners import labels
 
 GROUPS = {
     "right": "right, up to noise",
+    "scaled": "right up to a factor, an offset and noise",
     "law": "right law, parameters unknown",
     "wrong": "right in part",
     "pairs": "textbook pairs of two fidelities",
@@ -18,6 +19,7 @@ GROUPS = {
 """Of formulas."""
 PROBLEMS = {
     "right": ("wave", "growth", "throttle", "lens", "pipe"),
+    "scaled": ("scaled wave", "scaled growth", "scaled throttle", "scaled lens", "scaled pipe"),
     "law": ("creep", "beam", "inhibitor"),
     "wrong": (
         *("gain", "decay", "phase", "offset", "shear", "uptake"),

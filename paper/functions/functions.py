@@ -104,6 +104,9 @@ def tables(runs: Sequence[Run], experiment: Functions) -> dict[str, Table]:
         "error, CKA / formula fitted": _pooled("formula"),
         "median cell": _median("formula"),
         f"cells at most {MOST}": _share,
+        "decided": lambda part: sum(
+            each.high <= math.log(MOST) for each in _ratios(part, "formula").values()
+        ),
         f"cells above {TOO_MUCH}": lambda part: sum(
             each.mean > math.log(TOO_MUCH) for each in _ratios(part, "formula").values()
         ),

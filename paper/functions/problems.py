@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -89,6 +90,12 @@ for _name, _d, _formula in (
     ("pipe", 3, _pipe),
 ):  # fmt: skip
     _add(_name, _d, _formula, _formula, noise=0.1)
+    _spread = _formula(*SobolEngine(_d).draw(512, dtype=torch.float64).unbind(-1)).std()
+    _add(
+        *(f"scaled {_name}", _d),
+        partial(lambda *x, f, offset: 1.3 * f(*x) + offset, f=_formula, offset=0.4 * _spread),
+        *(_formula, 0.1),
+    )
 
 _add("gain", 1, lambda a: (0.5 + a) * (7 * a).sin(), lambda a: (7 * a).sin(), noise=0.05)
 _add("decay", 1, lambda a: (-4 * a).exp() + 0.1 * a, lambda a: (-3 * a).exp())
