@@ -10,7 +10,7 @@ from paper.common.learners import labels
 
 GROUPS = {
     "right": "right, up to noise",
-    "scaled": "right up to a factor, an offset and noise",
+    "scaled": "right, scaled and shifted",
     "law": "right law, parameters unknown",
     "wrong": "right in part",
     "pairs": "textbook pairs of two fidelities",

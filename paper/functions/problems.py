@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -85,17 +84,19 @@ def _growth(a: Tensor) -> Tensor:
     return 1 - (-3 * a).exp()
 
 
+def _scaled(formula: Callable[..., Tensor], d: int) -> Callable[..., Tensor]:
+    """Return 1.3 times a function of ``d`` inputs, plus 0.4 of its standard deviation."""
+    points = SobolEngine(d).draw(512, dtype=torch.float64)
+    offset = 0.4 * formula(*points.unbind(-1)).std()
+    return lambda *x: 1.3 * formula(*x) + offset
+
+
 for _name, _d, _formula in (
     ("wave", 1, _wave), ("growth", 1, _growth), ("throttle", 2, _throttle), ("lens", 3, _lens),
     ("pipe", 3, _pipe),
 ):  # fmt: skip
     _add(_name, _d, _formula, _formula, noise=0.1)
-    _spread = _formula(*SobolEngine(_d).draw(512, dtype=torch.float64).unbind(-1)).std()
-    _add(
-        *(f"scaled {_name}", _d),
-        partial(lambda *x, f, offset: 1.3 * f(*x) + offset, f=_formula, offset=0.4 * _spread),
-        *(_formula, 0.1),
-    )
+    _add(f"scaled {_name}", _d, _scaled(_formula, _d), _formula, noise=0.1)
 
 _add("gain", 1, lambda a: (0.5 + a) * (7 * a).sin(), lambda a: (7 * a).sin(), noise=0.05)
 _add("decay", 1, lambda a: (-4 * a).exp() + 0.1 * a, lambda a: (-3 * a).exp())
