@@ -128,7 +128,7 @@ def test_committed_numbers_are_made_again_or_called_stale():
 
     That command makes the expensive cases, too.
     """
-    assert check.check(EXPERIMENTS, known=False, budget=150) == {}
+    assert check.check(EXPERIMENTS, known=False, budget=100) == {}
 
 
 def test_the_list_of_stale_learners_is_of_those_that_there_are():
