@@ -1,7 +1,8 @@
 """Claims of the paper, with the numbers that decide.
 
 "In 6 trials" and "after 12" allow one trial more, "at trial 30" five. A level is reached by a trial
-if the cost is at most that at the trial, up to it, whose mean over the runs is least. Phy's decay
+if the cost at the best trial up to then, the one with the least mean over the runs, is at most the
+level. Best is by all trials (P6), sample efficiency by 1 to 25 (P7). Phy's decay
 is a mean of trials 13-25 above that of the trials from the first at 0.5 or below to 12, and no
 recovery a mean of 41-50 above 0.5. Never to learn, and to fail, is not to reach 0.5 (RRA in trials
 1-25). CKA holds if its mean of 41-50 is at most 0.45. RRA has caught up if its paired difference

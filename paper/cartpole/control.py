@@ -197,4 +197,5 @@ def trials_table(
     columns["worst of {}-{}".format(*late)] = lambda part: number(
         part.loc[part["episode"].between(*late), measure].max(), form
     )
-    return table(groups(own, "learner", labels), {**columns, "minus CKA's": gap})
+    columns["minus CKA's, {}-{}".format(*compared)] = gap
+    return table(groups(own, "learner", labels), columns)
