@@ -42,7 +42,7 @@ _TERMS = {
     "sin": "*sin({0})",
     "cos": "*cos({0})",
 }
-_KINDS = {("sign", True): ", as of dry friction", ("drag", True): ", as of drag"}
+_KINDS = {"sign": "dry friction", "drag": "drag"}
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -78,8 +78,14 @@ class Lack(Display):
         if self.shape == "constant":
             return f"{self.state}' lacks about {self.term} throughout: try an offset."
         if self.term:
-            kind = _KINDS.get((self.shape, self.state == self.over), "")
-            text = f"{self.state}' lacks about {self.term}{kind}: try such a term."
+            text = f"{self.state}' lacks about {self.term}"
+            kind, spec = _KINDS.get(self.shape), self.spec
+            if kind is None or self.over not in {*spec.states} - {*spec.angles}:
+                text += ": try such a term."
+            elif self.state == self.over:
+                text += f", as of {kind}: try such a term."
+            else:  # a force between two bodies moves both
+                text += f", perhaps the reaction to {kind} in {self.over}': try such a term there."
             if self.shape == "sign":  # a jump spoils slopes, and so the search
                 width = _SMOOTH_SIGN * self.at.square().mean().sqrt()
                 text += f" Write F*tanh({self.over}/{width:.1g}) for it, with F unknown."

@@ -81,6 +81,9 @@ def test_dry_friction_is_found_over_the_rate(dry):
         f"Write F*tanh(rate/{width:.1g}) for it, with F unknown."
     )
     assert sentence in dry.advice
+    other = repr(replace(lack, state="speed"))
+    assert "perhaps the reaction to dry friction in rate': try such a term there. Write" in other
+    assert f"rate' lacks about {lack.term}: try" in repr(replace(lack, over="torque"))
     off = lack.means + FRICTION * lack.middles.sign()
     clear = lack.middles.abs() > 0.3  # not where the rate changes its sign within a step
     assert (off[clear].abs() < 3 * lack.sd[clear]).all()
