@@ -68,15 +68,13 @@ def _model_free(curves: Curves) -> Finding:
 
 def _gp(curves: Curves) -> Finding:
     early = {name: curves.window(name, 3, 12).mean() for name in ("gp", "mf")}
-    least = int(curves.mean("gp").idxmin())
-    lowest = curves.window("gp", least, least)
     ends = curves.window("gp", LAST, LAST)
     measured = (
         f"mean of 3-12 {early['gp']:.1f} cm against {early['mf']:.1f}, {_described(curves, 'gp')}; "
         f"the worst run {ends.max():.1f} cm, the others {ends.drop(ends.idxmax()).mean():.1f}"
     )
     faster = within(curves.paired_difference("gp", 3, 12, reference="mf"), high=0)
-    return all_of(faster, within(Difference.of(lowest), low=10)), measured
+    return all_of(faster, within(curves.least("gp", LAST), low=10)), measured
 
 
 def _physics_alone(curves: Curves) -> Finding:
@@ -96,7 +94,7 @@ def _cka(curves: Curves) -> Finding:
         "variance": all_of(*(_less_spread(curves, "cka", o) for o in PAPER if o != "cka")),
     }
     measured = (
-        f"{_described(curves, 'cka')}; at 3 {early.mean:.1f} [{early.low:.1f}, {early.high:.1f}], "
+        f"{_described(curves, 'cka')}; at 3 {early.interval('.1f')}, "
         f"median {curves.window('cka', 3, 3).median():.1f}; sd over runs {spreads['cka']:.1f} cm, "
         f"the least of the others {spreads[other]:.1f} ({SCENARIOS[other].label}); "
     )
@@ -121,8 +119,7 @@ def _rra(curves: Curves) -> Finding:
     # To be as fast as what never gets there says nothing.
     fast: Verdict = "undetermined"
     if phy is not None:
-        best = int(curves.mean("rra").loc[: phy + 3].idxmin())
-        fast = within(Difference.of(curves.window("rra", best, best)), high=10)
+        fast = within(curves.least("rra", phy + 3), high=10)
     measured = (
         f"{_described(curves, 'rra')}, Phy 10 cm {reached(phy)}"
         + (" (to be as fast is undetermined)" if phy is None else "")
@@ -181,8 +178,7 @@ def _gp_map(maps: pd.DataFrame, curves: Curves) -> Finding:
     away = Difference.of(errors["gp"].loc[:, far].mean(axis=1))
     measured = (
         f"mean over targets {errors['gp'].mean(axis=None):.1f} cm, model-free "
-        f"{errors['mf'].mean(axis=None):.1f}; beyond {FAR:g} cm of the start {away.mean:.1f} "
-        f"[{away.low:.1f}, {away.high:.1f}]"
+        f"{errors['mf'].mean(axis=None):.1f}; beyond {FAR:g} cm of the start {away.interval('.1f')}"
     )
     return all_of(within(gap, high=0), within(away, low=LOW)), measured
 

@@ -2,14 +2,14 @@
 
 "In 6 trials" and "after 12" allow one trial more, "at trial 30" five. A level is reached by a trial
 if the cost at the best trial up to then, the one with the least mean over the runs, is at most the
-level. Best is by all trials (P6), sample efficiency by 1 to 25 (P7). Phy's decay
-is a mean of trials 13-25 above that of the trials from the first at 0.5 or below to 12, and no
-recovery a mean of 41-50 above 0.5. Never to learn, and to fail, is not to reach 0.5 (RRA in trials
-1-25). CKA holds if its mean of 41-50 is at most 0.45. RRA has caught up if its paired difference
-from CKA in trials 41 to 50 is at most 0.05. All are judged by 95 % intervals over the runs: where a
-bound lies in one, the claim is inconclusive. P4, P6 and P7 are judged in our form of the models, in
-which the paper has none of its learners: sine and cosine of the angle, differences of states, a
-prior at f_p for RRA, refreshed model data.
+level. Phy's decay is a mean of trials 13-25 above that of the trials from the first at 0.5 or below
+to 12, and no recovery a mean of 41-50 above 0.5. Never to learn, and to fail, is not to reach 0.5
+(RRA in trials 1-25). CKA holds if its mean of 41-50 is at most 0.45. RRA has caught up if its
+paired difference from CKA in trials 41 to 50 is at most 0.05. Best is by all trials (P6), sample
+efficiency by 1 to 25 (P7). All are judged by 95 % intervals over the runs: where a bound lies in
+one, the claim is inconclusive. P4, P6 and P7 are judged in our form of the models, in which the
+paper has none of its learners: sine and cosine of the angle, differences of states, a prior at f_p
+for RRA, refreshed model data.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _physics_alone(curves: Curves) -> Finding:
 def _gp(curves: Curves) -> Finding:
     ends = curves.window("gp-paper", 41, 50)
     learnt = f", at most 0.5 in {counted(int((ends <= 0.5).sum()))}"
-    verdict = within(_least(curves, "gp-paper", LAST), low=0.5)
+    verdict = within(curves.least("gp-paper", LAST), low=0.5)
     return verdict, _described(curves, "gp-paper") + learnt + _beside(curves, "gp")
 
 
@@ -69,13 +69,13 @@ def _cka(curves: Curves) -> Finding:
     )
     if better == "reproduced":
         verdict = "beaten"
-    soon, later = (_with_interval(_least(curves, "cka", trial)) for trial in (7, 13))
+    soon, later = (curves.least("cka", trial).interval(".2f") for trial in (7, 13))
     return verdict, f"in our form, {_described(curves, 'cka')}; by 7 {soon}, by 13 {later}"
 
 
 def _rra(curves: Curves) -> Finding:
     gap = curves.paired_difference("rra-paper", 41, 50)
-    failed = within(_least(curves, "rra-paper", 25), low=0.5)
+    failed = within(curves.least("rra-paper", 25), low=0.5)
     measured = f"{_described(curves, 'rra-paper')}, {gap.text()} compared with CKA"
     return all_of(failed, within(gap, high=0.05)), measured + _beside(curves, "rra")
 
@@ -114,27 +114,17 @@ CLAIMS = (
 )
 
 
-def _least(curves: Curves, name: str, last: int) -> Difference:
-    """Return the cost at the trial, up to one, whose mean over the runs is least."""
-    least = int(curves.mean(name).loc[:last].idxmin())
-    return Difference.of(curves.window(name, least, least))
-
-
 def _reaches(curves: Curves, name: str, level: float, last: int) -> Verdict:
     """Judge whether the cost is at most a level by a trial."""
-    return within(_least(curves, name, last), high=level)
+    return within(curves.least(name, last), high=level)
 
 
 def _described(curves: Curves, name: str) -> str:
-    least, late = _least(curves, name, LAST), Difference.of(curves.window(name, 41, 50))
+    least, late = curves.least(name, LAST), Difference.of(curves.window(name, 41, 50))
     return (
-        f"{curves.described(name, (0.5, 0.4))}, least {_with_interval(least)}, "
-        f"mean of 41-50 {_with_interval(late)}"
+        f"{curves.described(name, (0.5, 0.4))}, least {least.interval('.2f')}, "
+        f"mean of 41-50 {late.interval('.2f')}"
     )
-
-
-def _with_interval(value: Difference) -> str:
-    return f"{value.mean:.2f} [{value.low:.2f}, {value.high:.2f}]"
 
 
 def _beside(curves: Curves, name: str) -> str:

@@ -63,6 +63,10 @@ class Difference:
             return ""
         return f"{self.mean:+{form}}" + ("" if np.isnan(self.error) else f" ± {self.error:{form}}")
 
+    def interval(self, form: str) -> str:
+        """Return the mean and its 95 % interval."""
+        return f"{self.mean:{form}} [{self.low:{form}}, {self.high:{form}}]"
+
     def ratio(self, form: str = ".2f") -> str:
         """Return, for differences of logarithms, the geometric mean ratio and its 95 % interval."""
         if np.isnan(self.mean):
@@ -151,6 +155,11 @@ class Curves:
         """Return the mean over some episodes, by seed."""
         own = self.of(name)
         return own[own["episode"].between(first, last)].groupby("seed")[self.measure].mean()
+
+    def least(self, name: str, last: int) -> Difference:
+        """Return the measure at the best episode up to a last one, by the mean over the runs."""
+        best = int(self.mean(name).loc[:last].idxmin())
+        return Difference.of(self.window(name, best, best))
 
     def paired_difference(
         self, name: str, first: int, last: int, reference: str = "cka"

@@ -106,8 +106,20 @@ class TestArm:
         assert "at 121 of 121 targets by CKA, at none by model-free" in found["A6"].measured
         assert arm_verdicts(cka=lambda e: 5)["A4"].measured == "no results of mf"
 
+    @pytest.mark.parametrize(
+        ("spread", "low", "steady"),
+        [
+            (1.0, "reproduced", "reproduced"),
+            (3.0, "inconclusive", "inconclusive"),  # sd 3.9, by chi-squared 2.2 to 14.4
+            (8.0, "inconclusive", "not reproduced"),  # sd 10.3: 5.9 at least
+        ],
+    )
+    def test_errors_at_targets_are_judged_by_intervals_over_the_runs(self, spread, low, steady):
+        found = arm_verdicts(spread, mf=lambda e: 20.0, cka=lambda e: 5.0)
+        assert (found["A6"].verdict, found["A11"].verdict) == (low, steady)
 
-def arm_verdicts(**curves):
+
+def arm_verdicts(spread=0.0, **curves):
     """Verdicts on evaluations that are functions of the episode; maps rise with distance."""
     far, experiment = distance_from_start(), Arm()
     records = [
@@ -119,7 +131,8 @@ def arm_verdicts(**curves):
                 "all_steps": [curve(e) + seed * (0.01 if name == "cka" else 0.02)
                               for e in range(0, 31, 3)],
             },
-            "maps": {"9": {"all_steps": ((far > 1e9) + 5.0 if name == "cka" else 20 + far / 2)}},
+            "maps": {"9": {"all_steps": ((far > 1e9) + 5.0 + spread * (seed - 1.5)
+                                        if name == "cka" else 20 + far / 2)}},
             "episodes": {"coverage": [0.9, 0.9], "nlpd": [None] * 2, "rmse": [None] * 2},
         }
         for name, curve in curves.items()

@@ -105,11 +105,19 @@ class TestCartPole:
         assert found["P5"].verdict == "not reproduced"  # always 0.06 above CKA
         assert found["P6"].measured == "no results of gp"
 
+    def test_a_bound_within_the_interval_over_the_runs_is_inconclusive(self):
+        """The mean curves alone would say: does not learn, and reaches 0.5."""
+        curves = {"gp-paper": lambda e: 0.3, "phy": lambda e: 0.1, "mf": lambda e: 0.02}
+        found = judged(CLAIMS, curves, spread=0.3)  # 0.3 to 1.2, 0.1 to 1.0, 0.02 to 0.92
+        assert {found[name].verdict for name in ("P1", "P2", "P3")} == {"inconclusive"}
+        found = judged(CLAIMS, curves, spread=0.01)
+        assert [found[f"P{i}"].verdict for i in (1, 3)] == ["beaten", "not reproduced"]
 
-def judged(claims, curves, num_runs=4, num_episodes=50):
+
+def judged(claims, curves, num_runs=4, num_episodes=50, spread=1e-9):
     """Verdicts on curves that are given as functions of the episode."""
     rows = [
-        {"learner": name, "seed": seed, "episode": e, "cost": curve(e) + seed * 1e-9}
+        {"learner": name, "seed": seed, "episode": e, "cost": curve(e) + seed * spread}
         for name, curve in curves.items()
         for seed in range(num_runs)
         for e in range(1, num_episodes + 1)

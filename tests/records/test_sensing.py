@@ -81,7 +81,7 @@ def test_sensors_without_unknowns_change_nothing():
 @pytest.mark.slow
 def test_intervals_cover_the_parameters_of_sensor_and_spring():
     covered = []
-    for seed in range(12):
+    for seed in range(20):
         records, true = late_log(seed)
         found = identify(records, spring(), start=START, sensors=SENSORS)
         low, high = found.parameters.interval()
